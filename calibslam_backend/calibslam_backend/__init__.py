@@ -1,0 +1,1 @@
+"""Object SLAM from boxes that carry their own covariances: geometry, factors, map."""

@@ -1,0 +1,29 @@
+"""Installation of calibslam_backend; its executables go to lib/calibslam_backend/, where `ros2 run` looks for them."""
+
+from setuptools import find_packages, setup
+
+PACKAGE = "calibslam_backend"
+
+setup(
+    name=PACKAGE,
+    version="0.1.0",
+    packages=find_packages(exclude=["test"]),
+    data_files=[
+        ("share/ament_index/resource_index/packages", [f"resource/{PACKAGE}"]),
+        (f"share/{PACKAGE}", ["package.xml"]),
+    ],
+    package_data={PACKAGE: ["py.typed"]},
+    install_requires=["setuptools"],
+    zip_safe=True,
+    maintainer="CalibSLAM maintainers",
+    maintainer_email="maintainers@calibslam.invalid",
+    description="Object SLAM from boxes that carry their own covariances: geometry, factors, map.",
+    license="Apache-2.0",
+    classifiers=["License :: OSI Approved :: Apache Software License"],
+    entry_points={
+        "console_scripts": [
+            f"backend = {PACKAGE}.backend_node:main",
+            f"slam_bag = {PACKAGE}.slam_bag:main",
+        ],
+    },
+)

@@ -1,0 +1,1 @@
+"""Boxes with calibrated covariances: a calibrator for the boxes of any detector."""

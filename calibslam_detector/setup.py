@@ -1,0 +1,27 @@
+"""Installation of calibslam_detector; its executables go to lib/calibslam_detector/, where `ros2 run` looks for them."""
+
+from setuptools import find_packages, setup
+
+PACKAGE = "calibslam_detector"
+
+setup(
+    name=PACKAGE,
+    version="0.1.0",
+    packages=find_packages(exclude=["test"]),
+    data_files=[
+        ("share/ament_index/resource_index/packages", [f"resource/{PACKAGE}"]),
+        (f"share/{PACKAGE}", ["package.xml"]),
+    ],
+    package_data={PACKAGE: ["py.typed"]},
+    install_requires=["setuptools"],
+    zip_safe=True,
+    maintainer="CalibSLAM maintainers",
+    maintainer_email="maintainers@calibslam.invalid",
+    description="Boxes with calibrated covariances: a calibrator for the boxes of any detector.",
+    license="Apache-2.0",
+    classifiers=["License :: OSI Approved :: Apache Software License"],
+    entry_points={
+        "console_scripts": [f"calibrator = {PACKAGE}.calibrator_node:main"],
+        "calibslam.calibrators": [f"default = {PACKAGE}.calibrator:load"],
+    },
+)

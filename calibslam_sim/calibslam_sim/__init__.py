@@ -1,0 +1,1 @@
+"""Simulated worlds, odometry, bags, replay and evaluation for CalibSLAM."""

@@ -1,0 +1,33 @@
+"""Installation of calibslam_sim; its executables go to lib/calibslam_sim/, where `ros2 run` looks for them."""
+
+from setuptools import find_packages, setup
+
+PACKAGE = "calibslam_sim"
+
+setup(
+    name=PACKAGE,
+    version="0.1.0",
+    packages=find_packages(exclude=["test"]),
+    data_files=[
+        ("share/ament_index/resource_index/packages", [f"resource/{PACKAGE}"]),
+        (f"share/{PACKAGE}", ["package.xml"]),
+    ],
+    package_data={PACKAGE: ["py.typed"]},
+    install_requires=["setuptools"],
+    zip_safe=True,
+    maintainer="CalibSLAM maintainers",
+    maintainer_email="maintainers@calibslam.invalid",
+    description="Simulated worlds, odometry, bags, replay and evaluation for CalibSLAM.",
+    license="Apache-2.0",
+    classifiers=["License :: OSI Approved :: Apache Software License"],
+    entry_points={
+        "console_scripts": [
+            f"demo = {PACKAGE}.demo:main",
+            f"evaluate = {PACKAGE}.evaluate:main",
+            f"odometry = {PACKAGE}.odometry_node:main",
+            f"play = {PACKAGE}.play_node:main",
+            f"simulate = {PACKAGE}.simulate:main",
+            f"tum_to_bag = {PACKAGE}.tum_to_bag:main",
+        ],
+    },
+)
