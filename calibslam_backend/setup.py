@@ -1,4 +1,4 @@
-"""Installation of calibslam_backend; its executables go to lib/calibslam_backend/, where `ros2 run` looks for them."""
+"""Installation of calibslam_backend; executables go to lib/calibslam_backend/ for `ros2 run`."""
 
 from setuptools import find_packages, setup
 

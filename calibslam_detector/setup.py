@@ -1,4 +1,4 @@
-"""Installation of calibslam_detector; its executables go to lib/calibslam_detector/, where `ros2 run` looks for them."""
+"""Installation of calibslam_detector; executables go to lib/calibslam_detector/ for `ros2 run`."""
 
 from setuptools import find_packages, setup
 

@@ -1,4 +1,4 @@
-"""Installation of calibslam_sim; its executables go to lib/calibslam_sim/, where `ros2 run` looks for them."""
+"""Installation of calibslam_sim; executables go to lib/calibslam_sim/ for `ros2 run`."""
 
 from setuptools import find_packages, setup
 
