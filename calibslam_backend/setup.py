@@ -19,7 +19,6 @@ setup(
     maintainer_email="maintainers@calibslam.invalid",
     description="Object SLAM from boxes that carry their own covariances: geometry, factors, map.",
     license="Apache-2.0",
-    classifiers=["License :: OSI Approved :: Apache Software License"],
     entry_points={
         "console_scripts": [
             f"backend = {PACKAGE}.backend_node:main",

@@ -19,7 +19,6 @@ setup(
     maintainer_email="maintainers@calibslam.invalid",
     description="Boxes with calibrated covariances: a calibrator for the boxes of any detector.",
     license="Apache-2.0",
-    classifiers=["License :: OSI Approved :: Apache Software License"],
     entry_points={
         "console_scripts": [f"calibrator = {PACKAGE}.calibrator_node:main"],
         "calibslam.calibrators": [f"default = {PACKAGE}.calibrator:load"],

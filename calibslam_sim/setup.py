@@ -19,7 +19,6 @@ setup(
     maintainer_email="maintainers@calibslam.invalid",
     description="Simulated worlds, odometry, bags, replay and evaluation for CalibSLAM.",
     license="Apache-2.0",
-    classifiers=["License :: OSI Approved :: Apache Software License"],
     entry_points={
         "console_scripts": [
             f"demo = {PACKAGE}.demo:main",
