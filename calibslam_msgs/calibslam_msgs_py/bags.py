@@ -1,0 +1,253 @@
+"""The one module that reads and writes bags: rosbag2 folders in MCAP format, through rosbags, without ROS.
+
+What is written, `ros2 bag`, the mcap tools and Foxglove read: CDR messages, their definitions inside, chunks
+compressed with zstd. The same input gives the same bytes (rosbags writes no times or identifiers of its own).
+"""
+
+from __future__ import annotations
+
+import shutil
+from collections import Counter
+from collections.abc import Collection, Iterator
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Literal
+
+from rosbags.interfaces import Connection, MessageDefinitionFormat
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, Reader, StoragePlugin, Writer
+from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
+from rosbags.typesys.store import Typestore
+
+from calibslam_msgs_py.bag_types import BagError, BagTypes, calibslam_typestore
+
+__all__ = ["BagError", "BagReader", "BagWriter", "types"]
+
+# The message classes of bags, for `conversions`.
+types = BagTypes()
+
+# The metadata format of ROS 2 Jazzy.
+ROSBAG2_VERSION: Literal[9] = 9
+
+
+class BagReader:
+    """Reads a rosbag2 folder or a single .mcap file; a context manager.
+
+    Attributes:
+        path: of the bag.
+        topics: name -> message type.
+        counts: name -> number of messages.
+        start, end: log times of the first and last message [ns]; 0 where there is none.
+        rejected: topic -> number of messages that could not be decoded and were skipped.
+
+    Raises:
+        BagError: no bag, or one that cannot be read.
+    """
+
+    def __init__(self, path: str | Path) -> None:
+        self.path = Path(path)
+        self.rejected: Counter[str] = Counter()
+        self._reader = _open(self.path)
+        connections = self._reader.connections
+        self.topics: dict[str, str] = {c.topic: c.msgtype for c in sorted(connections, key=lambda c: c.topic)}
+        self.counts: Counter[str] = Counter()
+        for connection in connections:
+            self.counts[connection.topic] += connection.msgcount
+        empty = self._reader.message_count == 0
+        self.start = 0 if empty else self._reader.start_time
+        self.end = 0 if empty else self._reader.end_time - 1  # rosbags gives the time after the last
+
+    def __enter__(self) -> BagReader:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._reader.close()
+
+    def messages(self, topics: Collection[str]) -> Iterator[tuple[str, int, Any]]:
+        """(topic, log time [ns], message) of these topics in the order of the log times.
+
+        Raises:
+            BagError: a topic is missing, its type is unknown, or the file is damaged.
+        """
+        connections = self._connections(topics)
+        store = self._typestore(connections)
+        for connection, time, data in self._raw(connections):
+            try:
+                message = store.deserialize_cdr(data, connection.msgtype)
+            except Exception:  # whatever garbage makes of generated code
+                self.rejected[connection.topic] += 1
+                continue
+            yield connection.topic, time, message
+
+    def raw_messages(self, topics: Collection[str]) -> Iterator[tuple[str, int, bytes]]:
+        """As `messages`, but serialised (CDR), as an rclpy publisher takes them."""
+        for connection, time, data in self._raw(self._connections(topics)):
+            yield connection.topic, time, bytes(data)
+
+    def _connections(self, topics: Collection[str]) -> list[Connection]:
+        if missing := sorted(set(topics) - set(self.topics)):
+            there = "\n".join(
+                f"  {name}  ({kind}, {self.counts[name]})" for name, kind in self.topics.items()
+            )
+            raise BagError(f"{self.path} has no topic {', '.join(missing)}; it has:\n{there or '  none'}")
+        return [connection for connection in self._reader.connections if connection.topic in topics]
+
+    def _typestore(self, connections: list[Connection]) -> Typestore:
+        """The definitions inside the bag; those of ROS 2 Jazzy and of this version where it has none."""
+        store = get_typestore(Stores.EMPTY)
+        fallback = calibslam_typestore()
+        for connection in connections:
+            name, definition = connection.msgtype, connection.msgdef
+            try:
+                if definition.format is MessageDefinitionFormat.MSG:
+                    store.register(get_types_from_msg(definition.data, name))
+                elif definition.format is MessageDefinitionFormat.IDL:
+                    store.register(get_types_from_idl(definition.data))
+                elif name in fallback.fielddefs:
+                    store.register(get_types_from_msg(fallback.generate_msgdef(name, ros_version=2)[0], name))
+            except Exception as error:
+                raise BagError(
+                    f"{self.path}: the definition of {name} (topic {connection.topic}) is not usable: {error}"
+                ) from error
+            if name not in store.fielddefs:
+                raise BagError(
+                    f"{self.path}: unknown message type {name} (topic {connection.topic}): the bag holds no "
+                    "definition of it; record it again with MCAP storage, which stores definitions"
+                )
+        return store
+
+    def _raw(self, connections: list[Connection]) -> Iterator[tuple[Connection, int, bytes | memoryview]]:
+        messages = self._reader.messages(connections) if connections else iter(())
+        while True:
+            try:
+                item = next(messages)
+            except StopIteration:
+                return
+            except Exception as error:  # rosbags passes on whatever a damaged chunk raises
+                raise _damaged(self.path, error) from error
+            yield item
+
+
+def _open(path: Path) -> Reader:
+    if not path.exists():
+        raise BagError(f"{path} does not exist; expected a rosbag2 folder or an .mcap file")
+    if path.is_dir() and not (path / "metadata.yaml").exists():
+        files = sorted(path.glob("*.mcap"))
+        if len(files) != 1:
+            raise BagError(
+                f"{path} is not a rosbag2 folder: it has no metadata.yaml and {len(files)} .mcap files; "
+                f"if it was recorded and interrupted: ros2 bag reindex {path}"
+            )
+        path = files[0]  # an interrupted recording: the file may well be complete
+    if path.is_file() and path.suffix not in (".mcap", ".db3"):
+        raise BagError(f"{path} is not a bag; expected a rosbag2 folder or an .mcap file")
+    try:
+        reader = Reader(path)
+        reader.open()
+    except Exception as error:  # rosbags passes on whatever a damaged file raises
+        raise _damaged(path, error) from error
+    return reader
+
+
+def _damaged(path: Path, error: Exception) -> BagError:
+    files = sorted(path.glob("*.mcap")) if path.is_dir() else [path]
+    file = files[0] if files else path / "FILE.mcap"
+    reason = str(error) or type(error).__name__
+    return BagError(
+        f"{path} cannot be read, it is truncated or damaged ({reason}); "
+        f"recover what is left with: mcap recover {file} -o recovered.mcap"
+    )
+
+
+class BagWriter:
+    """Writes a rosbag2 folder, or a single file if the path ends in .mcap; a context manager.
+
+    If the context is left by an exception, nothing stays behind.
+
+    Args:
+        path: of the bag; missing parent folders are made.
+        overwrite: replace an existing bag (never anything that is not a bag).
+
+    Raises:
+        BagError: the path exists.
+    """
+
+    def __init__(self, path: str | Path, overwrite: bool = False) -> None:
+        self.path = Path(path)
+        if self.path.exists() or self.path.is_symlink():
+            if not overwrite:
+                raise BagError(f"{self.path} exists already; remove it or choose another path")
+            _remove_bag(self.path)
+        self._single_file = self.path.suffix == ".mcap"
+        # rosbags writes folders only: a single file is written in one beside it, and moved out at the end.
+        self._scratch = self.path.with_name(f".{self.path.name}.part")
+        folder = self._scratch / self.path.stem if self._single_file else self.path
+        if self._single_file and self._scratch.exists():
+            shutil.rmtree(self._scratch)
+        self._store = calibslam_typestore()
+        self._connections: dict[str, Connection] = {}
+        self._writer = Writer(folder, version=ROSBAG2_VERSION, storage_plugin=StoragePlugin.MCAP)
+        self._writer.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)
+        try:
+            self._writer.open()
+        except OSError as error:
+            raise BagError(f"cannot write {self.path}: {error}") from error
+
+    def __enter__(self) -> BagWriter:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if kind is None:
+            self._writer.close()
+            if self._single_file:
+                (self._writer.path / f"{self.path.stem}.mcap").replace(self.path)
+        else:
+            self._writer.abort()
+            if not self._single_file:
+                shutil.rmtree(self.path, ignore_errors=True)
+        if self._single_file:
+            shutil.rmtree(self._scratch, ignore_errors=True)
+
+    def write(self, topic: str, message: Any, stamp: int) -> None:
+        """Add a message of `bags.types` at a log time [ns]; the topic is made with the first message."""
+        kind = message.__msgtype__
+        self.write_raw(topic, kind, self._store.serialize_cdr(message, kind), stamp)
+
+    def write_raw(self, topic: str, kind: str, data: bytes | memoryview, stamp: int) -> None:
+        """Add a serialised (CDR) message of type `kind`, such as "nav_msgs/msg/Path"."""
+        self.add_topic(topic, kind)
+        self._writer.write(self._connections[topic], int(stamp), data)
+
+    def add_topic(self, topic: str, kind: str) -> None:
+        """Make a topic, also if no message follows.
+
+        Raises:
+            BagError: the type is unknown, or the topic has another type.
+        """
+        connection = self._connections.get(topic)
+        if connection is None:
+            if kind not in self._store.fielddefs:
+                raise BagError(f"unknown message type {kind} for topic {topic}")
+            self._connections[topic] = self._writer.add_connection(topic, kind, typestore=self._store)
+        elif connection.msgtype != kind:
+            raise BagError(f"topic {topic} has type {connection.msgtype}, not {kind}")
+
+
+def _remove_bag(path: Path) -> None:
+    """Remove a bag, and refuse to remove anything else."""
+    if path.is_file() and path.suffix == ".mcap":
+        path.unlink()
+        return
+    foreign = (
+        [p for p in path.iterdir() if p.name != "metadata.yaml" and p.suffix != ".mcap"]
+        if path.is_dir()
+        else [path]
+    )
+    if foreign:
+        raise BagError(
+            f"{path} is not overwritten: it is not a bag, or holds other files ({foreign[0].name})"
+        )
+    shutil.rmtree(path)

@@ -1,0 +1,115 @@
+"""BoundingBoxArray <-> Boxes, and which boxes can be used."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from calibslam_msgs_py.covariance import is_covariance, symmetric
+from calibslam_msgs_py.geometry_conversions import (
+    UNKNOWN,
+    doubles_of,
+    header_to_msg,
+    stamp_from_msg,
+    unknown_covariance,
+)
+from calibslam_msgs_py.measurements import Array, Boxes, InvalidMeasurement
+from calibslam_msgs_py.message_types import MessageTypes
+
+
+def boxes_from_msg(msg: Any) -> Boxes:
+    """Boxes of a BoundingBoxArray, unfiltered: see `valid_boxes`.
+
+    Raises:
+        InvalidMeasurement: the image has no size, or a field has the wrong length.
+    """
+    if msg.width < 1 or msg.height < 1:
+        raise InvalidMeasurement("image_size", f"boxes of an image of {msg.width} x {msg.height} pixels")
+    corners = [doubles_of(box.corners, 4, "corners of a box") for box in msg.boxes]
+    covariances = [
+        _box_covariance(doubles_of(box.covariance, 16, "covariance of a box")) for box in msg.boxes
+    ]
+    return Boxes(
+        stamp=stamp_from_msg(msg.header.stamp),
+        width=int(msg.width),
+        height=int(msg.height),
+        corners=np.array(corners).reshape(-1, 4),
+        covariances=np.array(covariances).reshape(-1, 4, 4),
+        class_ids=tuple(str(box.class_id) for box in msg.boxes),
+        scores=np.array([box.score for box in msg.boxes], dtype=np.float64),
+        object_ids=tuple(str(box.object_id) for box in msg.boxes),
+        frame_id=str(msg.header.frame_id),
+    )
+
+
+def _box_covariance(flat: Array) -> Array:
+    """(4, 4), NaN throughout where unknown.
+
+    NaN in a message is a defect and not "unknown": it becomes infinite, which no check lets pass.
+    """
+    if flat[0] == UNKNOWN:
+        return np.full((4, 4), np.nan)
+    return np.where(np.isnan(flat), np.inf, flat).reshape(4, 4)
+
+
+def valid_boxes(boxes: Boxes) -> tuple[Boxes, dict[str, int]]:
+    """The usable boxes, and how many were dropped for which reason.
+
+    Reasons: `nan` (corner or score not finite), `empty` (xmin >= xmax or ymin >= ymax), `outside` (no part of
+    the box in the image), `covariance` (known, but not finite, symmetric and positive definite). A box counts
+    once, under the first that applies.
+    """
+    xmin, ymin, xmax, ymax = boxes.corners.T
+    finite = np.isfinite(boxes.corners).all(axis=1) & np.isfinite(boxes.scores)
+    outside = (xmax <= 0.0) | (ymax <= 0.0) | (xmin >= boxes.width) | (ymin >= boxes.height)
+    defects = {
+        "nan": ~finite,
+        "empty": (xmin >= xmax) | (ymin >= ymax),
+        "outside": outside,
+        "covariance": boxes.has_covariance & ~is_covariance(boxes.covariances),
+    }
+    keep = np.ones(len(boxes), dtype=bool)
+    rejected = {}
+    for reason, defect in defects.items():
+        if count := int((keep & defect).sum()):
+            rejected[reason] = count
+        keep &= ~defect
+    return (boxes if keep.all() else boxes_where(boxes, keep)), rejected
+
+
+def boxes_where(boxes: Boxes, keep: np.ndarray) -> Boxes:
+    """The boxes for which `keep` (N,) is true."""
+    rows = np.flatnonzero(keep)
+    return Boxes(
+        stamp=boxes.stamp,
+        width=boxes.width,
+        height=boxes.height,
+        corners=boxes.corners[rows],
+        covariances=boxes.covariances[rows],
+        class_ids=tuple(boxes.class_ids[i] for i in rows),
+        scores=boxes.scores[rows],
+        object_ids=tuple(boxes.object_ids[i] for i in rows),
+        frame_id=boxes.frame_id,
+    )
+
+
+def boxes_to_msg(boxes: Boxes, types: MessageTypes) -> Any:
+    """A BoundingBoxArray."""
+    box = types("calibslam_msgs/msg/BoundingBox")
+    known = boxes.has_covariance
+    return types("calibslam_msgs/msg/BoundingBoxArray")(
+        header=header_to_msg(boxes.stamp, boxes.frame_id, types),
+        width=int(boxes.width),
+        height=int(boxes.height),
+        boxes=[
+            box(
+                corners=np.array(boxes.corners[i], dtype=np.float64),
+                covariance=symmetric(boxes.covariances[i]).ravel() if known[i] else unknown_covariance(4),
+                class_id=str(boxes.class_ids[i]),
+                score=float(boxes.scores[i]),
+                object_id=str(boxes.object_ids[i]),
+            )
+            for i in range(len(boxes))
+        ],
+    )
