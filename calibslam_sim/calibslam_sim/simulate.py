@@ -1,0 +1,92 @@
+"""`simulate`: a recording of a simulated desk, as a bag with ground truth."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from calibslam_msgs_py import bags
+from calibslam_msgs_py.conversions import boxes_to_msg, camera_to_msg, quadrics_to_msg, stamped_pose_to_msg
+from calibslam_msgs_py.measurements import QuadricEstimate, StampedPose
+from calibslam_msgs_py.settings import add_arguments, from_arguments
+from calibslam_sim import topics
+from calibslam_sim.simulation import SCENARIOS, Simulation, SimulationSettings, simulate
+
+SCENARIO_HELP = "which defaults the other options have (default: desk); " + "; ".join(
+    f"{name}: {', '.join(f'{option} {value:g}' for option, value in changes.items()) or 'as stated here'}"
+    for name, changes in SCENARIOS.items()
+)
+
+
+def write_bag(simulation: Simulation, path: Path, overwrite: bool = False) -> None:
+    """Write what was measured and the truth.
+
+    Topics: /odom, /detections, /camera/camera_info and /ground_truth for every image, /ground_truth_quadrics
+    once. The identity of a box is the id of the true quadric.
+    """
+    types = bags.types
+    T_odom_camera = [np.eye(4)]
+    for motion in simulation.odometry:
+        T_odom_camera.append(T_odom_camera[-1] @ motion.T_start_end)
+    times = [int(stamp) for stamp in simulation.times]
+    poses = [StampedPose(stamp, T) for stamp, T in zip(times, T_odom_camera, strict=True)]
+    step_covariance = simulation.odometry[0].covariance if simulation.odometry else None
+    quadrics = [
+        QuadricEstimate(
+            id=thing.id,
+            class_id=thing.class_id,
+            T_map_object=thing.ellipsoid.T_world_object,
+            radii=thing.ellipsoid.radii,
+            covariance=np.zeros((9, 9)),
+            observations=sum(str(thing.id) in boxes.object_ids for boxes in simulation.boxes),
+        )
+        for thing in simulation.world
+    ]
+    with bags.BagWriter(path, overwrite) as bag:
+        bag.write(
+            topics.GROUND_TRUTH_QUADRICS, quadrics_to_msg(times[0], quadrics, types, topics.WORLD), times[0]
+        )
+        for k, odometry in enumerate(topics.odometry_msgs(poses, step_covariance, types)):
+            stamp = times[k]
+            truth = StampedPose(stamp, simulation.T_world_camera[k])
+            bag.write(topics.ODOMETRY, odometry, stamp)
+            bag.write(topics.CAMERA_INFO, camera_to_msg(simulation.camera, stamp, types), stamp)
+            bag.write(topics.GROUND_TRUTH, stamped_pose_to_msg(truth, topics.WORLD, types), stamp)
+            bag.write(topics.DETECTIONS, boxes_to_msg(simulation.boxes[k], types), stamp)
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Command line of `simulate`; returns the exit code."""
+    # The scenario decides the defaults of the other options.
+    first = argparse.ArgumentParser(add_help=False)
+    first.add_argument("--scenario", choices=sorted(SCENARIOS), default="desk", help=SCENARIO_HELP)
+    scenario = first.parse_known_args(argv)[0].scenario
+    parser = argparse.ArgumentParser(prog="simulate", description=__doc__, parents=[first])
+    parser.add_argument("--out", type=Path, required=True, metavar="BAG", help="folder to write")
+    parser.add_argument("--overwrite", action="store_true", help="replace the bag if it exists")
+    add_arguments(parser, SimulationSettings)
+    parser.set_defaults(**SCENARIOS[scenario])
+    arguments = parser.parse_args(argv)
+    settings = from_arguments(arguments, SimulationSettings)
+    start = time.monotonic()
+    try:
+        simulation = simulate(settings)
+        write_bag(simulation, arguments.out, arguments.overwrite)
+    except bags.BagError as error:
+        print(f"simulate: {error}", file=sys.stderr)
+        return 1
+    print(
+        f"{arguments.out}: {len(simulation.times)} images, {sum(map(len, simulation.boxes))} boxes of "
+        f"{len(simulation.world)} objects, scenario {scenario}, seed {settings.seed} "
+        f"({time.monotonic() - start:.1f} s)"
+    )
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
