@@ -99,22 +99,23 @@ class BagReader:
         fallback = calibslam_typestore()
         for connection in connections:
             name, definition = connection.msgtype, connection.msgdef
+            text = definition.data
+            if not text.strip():  # recorded where the type was not installed, or by an old version of ROS
+                if name not in fallback.fielddefs:
+                    raise BagError(
+                        f"{self.path}: unknown message type {name} (topic {connection.topic}): the bag holds "
+                        "no definition of it; record it again where that package is installed"
+                    )
+                text = fallback.generate_msgdef(name, ros_version=2)[0]
             try:
-                if definition.format is MessageDefinitionFormat.MSG:
-                    store.register(get_types_from_msg(definition.data, name))
-                elif definition.format is MessageDefinitionFormat.IDL:
-                    store.register(get_types_from_idl(definition.data))
-                elif name in fallback.fielddefs:
-                    store.register(get_types_from_msg(fallback.generate_msgdef(name, ros_version=2)[0], name))
+                if definition.format is MessageDefinitionFormat.IDL:
+                    store.register(get_types_from_idl(text))
+                else:
+                    store.register(get_types_from_msg(text, name))
             except Exception as error:
                 raise BagError(
                     f"{self.path}: the definition of {name} (topic {connection.topic}) is not usable: {error}"
                 ) from error
-            if name not in store.fielddefs:
-                raise BagError(
-                    f"{self.path}: unknown message type {name} (topic {connection.topic}): the bag holds no "
-                    "definition of it; record it again with MCAP storage, which stores definitions"
-                )
         return store
 
     def _raw(self, connections: list[Connection]) -> Iterator[tuple[Connection, int, bytes | memoryview]]:

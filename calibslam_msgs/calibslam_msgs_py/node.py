@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import signal
 import sys
+import threading
 from collections import Counter
 from collections.abc import Callable, Sequence
 
@@ -12,6 +14,7 @@ from rclpy.clock import Clock, ClockType
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy, qos_profile_sensor_data
+from rclpy.signals import SignalHandlerOptions
 
 from calibslam_msgs_py.settings import SettingsError
 
@@ -28,29 +31,43 @@ LATCHED = QoSProfile(
 )
 
 BAD_SETTINGS = 2  # exit code
+SIGNAL_LATENCY = 0.1  # how long a waiting executor may not see a signal [s]
 
 
 def run(node_factory: Callable[[], Node], args: Sequence[str] | None = None) -> int:
     """Run one node in one thread until SIGINT or SIGTERM; returns the exit code.
 
-    Both signals end it with 0: that is how a node ends. A bad or unknown parameter ends it with 2 and a line that
-    says why. `node.close()`, where there is one, is called at the end; the context is shut down by then, so it
-    can write files, but no longer publish.
+    Both signals end it with 0, after the callback that runs; a second one ends it at once. A bad or unknown
+    parameter ends it with 2 and a line that says why. `node.close()`, where there is one, is called at the
+    end and may still publish.
 
     Args:
         node_factory: makes the node; called after rclpy is initialised.
         args: as on the command line; None: those of this process.
     """
+    stop = threading.Event()
+
+    def on_signal(number: int, frame: object) -> None:
+        stop.set()
+        for each in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(each, signal.SIG_DFL)
+
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, on_signal)
     node: Node | None = None
     try:
-        rclpy.init(args=list(args) if args is not None else None)
+        # rclpy's own handlers shut the context down under the running executor, which then fails at times.
+        rclpy.init(
+            args=list(args) if args is not None else None, signal_handler_options=SignalHandlerOptions.NO
+        )
         node = node_factory()
         refuse_unknown_parameters(node)
         executor = SingleThreadedExecutor()
         executor.add_node(node)
-        executor.spin()
-    except (KeyboardInterrupt, ExternalShutdownException):
-        pass
+        while rclpy.ok() and not stop.is_set():
+            executor.spin_once(timeout_sec=SIGNAL_LATENCY)
+    except ExternalShutdownException:
+        pass  # the node shut the context down itself: it is done
     except SettingsError as error:
         print(f"error: {error}", file=sys.stderr)
         return BAD_SETTINGS

@@ -191,14 +191,13 @@ def _checked(field: dataclasses.Field[Any], kind: type, value: Any) -> Any:
     expected = {bool: "true or false", int: "an integer", float: "a number", str: "a text"}[kind]
     accepted = (int, float) if kind is float else (kind,)
     if not isinstance(value, accepted) or (isinstance(value, bool) and kind is not bool):
-        raise SettingsError(f"{field.name} = {value!r}: must be {expected}; it is the {describe(field)}")
+        raise SettingsError(f"{field.name} = {value!r}: must be {expected} ({describe(field)})")
     value = kind(value)
     low, high, choices = field.metadata["low"], field.metadata["high"], field.metadata["choices"]
     outside = (low is not None and value < low) or (high is not None and value > high)
     if outside or (choices and value not in choices) or (kind is float and math.isnan(value)):
-        raise SettingsError(
-            f"{field.name} = {value!r}: must be {_valid(field) or expected}; it is the {field.metadata['meaning']}"
-        )
+        valid = _valid(field) or expected
+        raise SettingsError(f"{field.name} = {value!r}: must be {valid} ({describe(field)})")
     return value
 
 
