@@ -9,7 +9,7 @@ import pytest
 
 PROJECT = Path(__file__).resolve().parents[1]
 # What the script itself needs, for a PATH that has nothing else.
-TOOLS = "bash cat cut dirname env flock grep head mkdir readlink rm sed sha256sum tail".split()
+TOOLS = [
     "bash",
     "cat",
     "cut",
@@ -24,7 +24,7 @@ TOOLS = "bash cat cut dirname env flock grep head mkdir readlink rm sed sha256su
     "sed",
     "sha256sum",
     "tail",
-)
+]
 
 
 @pytest.fixture
