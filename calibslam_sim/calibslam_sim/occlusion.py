@@ -6,6 +6,7 @@ import numpy as np
 
 from calibslam_backend.quadric import Ellipsoid
 from calibslam_msgs_py.measurements import Array
+from calibslam_sim.sampling import unit_cube
 
 POINTS = 27
 
@@ -29,11 +30,9 @@ def hidden_shares(ellipsoids: list[Ellipsoid], p_world_camera: Array) -> Array:
 def _points_inside(ellipsoid: Ellipsoid) -> Array:
     """Points (POINTS, 3) in the world, spread evenly over the volume.
 
-    From a sequence of low discrepancy in the unit cube (R3 of Roberts, 2018: multiples of
-    powers of 1 / g with g^4 = g + 1), so that no two points share a direction.
+    No two of them share a direction, so that one behind the other cannot count for many.
     """
-    g = 1.2207440846057596
-    u = (0.5 + np.outer(np.arange(1, POINTS + 1), g ** -np.arange(1.0, 4.0))) % 1.0
+    u = unit_cube(POINTS)
     radius, height, angle = np.cbrt(u[:, 0]), 2.0 * u[:, 1] - 1.0, 2.0 * np.pi * u[:, 2]
     flat = np.sqrt(1.0 - height**2)
     sphere = radius[:, None] * np.column_stack([flat * np.cos(angle), flat * np.sin(angle), height])

@@ -1,0 +1,71 @@
+"""Node `calibrator`: gives the boxes of a foreign detector a covariance.
+
+Boxes that have one keep it. Boxes that cannot be used are left out and counted; the stamp stays that of
+the image.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from calibslam_msgs.msg import BoundingBoxArray
+from rclpy.node import Node
+
+from calibslam_detector.calibrator import CalibratorError, load
+from calibslam_msgs_py.conversions import RosTypes, boxes_from_msg, boxes_to_msg, valid_boxes
+from calibslam_msgs_py.measurements import InvalidMeasurement
+from calibslam_msgs_py.node import MEASUREMENT, Counters, run
+from calibslam_msgs_py.settings import Settings, SettingsError, declare_parameters, setting
+
+SECONDS_BETWEEN_WARNINGS = 5.0
+
+
+@dataclass(frozen=True)
+class CalibratorNodeSettings(Settings):
+    """Parameters of the node."""
+
+    calibrator: str = setting("", "calibrator file (JSON); empty: a stated error per box size")
+
+
+class CalibratorNode(Node):
+    """detections_raw -> detections."""
+
+    def __init__(self) -> None:
+        super().__init__("calibrator")
+        settings = declare_parameters(self, CalibratorNodeSettings)
+        try:
+            self._calibrate = load(settings.calibrator or None)
+        except CalibratorError as error:
+            raise SettingsError(str(error)) from error
+        self._types = RosTypes()
+        self._counters = Counters(self)
+        self._publisher = self.create_publisher(BoundingBoxArray, "detections", MEASUREMENT)
+        self.create_subscription(BoundingBoxArray, "detections_raw", self._receive, MEASUREMENT)
+
+    def _receive(self, message: Any) -> None:
+        try:
+            boxes, rejected = valid_boxes(boxes_from_msg(message))
+        except InvalidMeasurement as error:
+            self._reject(error.reason, 1, f"image left out: {error}")
+            return
+        for reason, count in rejected.items():
+            self._reject(reason, count, f"{count} boxes left out: {reason}")
+        self._publisher.publish(boxes_to_msg(self._calibrate(boxes), self._types))
+        self._counters.count("images")
+        self._counters.count("boxes", len(boxes))
+
+    def _reject(self, reason: str, count: int, text: str) -> None:
+        self._counters.count(f"rejected_{reason}", count)
+        self.get_logger().warning(text, throttle_duration_sec=SECONDS_BETWEEN_WARNINGS)
+
+
+def main(args: Sequence[str] | None = None) -> int:
+    """Runs the node; returns the exit code."""
+    return run(CalibratorNode, args)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
