@@ -1,0 +1,134 @@
+"""Which landmark a track belongs to.
+
+A landmark predicts a box, with the uncertainty of the pose, of the quadric and of the measurement. The squared
+Mahalanobis distance of a measured box to it is chi-squared with four degrees of freedom if they belong together.
+All open tracks of a keyframe are assigned at once, and a track is bound to a landmark only after several
+keyframes agree: one coincidence costs nothing, one wrong binding costs the map.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass
+
+import numpy as np
+from calibslam_msgs_py.measurements import Array
+from calibslam_msgs_py.settings import Settings, setting
+from scipy.optimize import linear_sum_assignment
+from scipy.stats import chi2
+
+from calibslam_backend.box_measurement import BoxMeasurement
+from calibslam_backend.quadric import Ellipsoid, box_of_visible_part
+from calibslam_backend.tracking import overlap
+
+GIVEN, ESTIMATED = "given", "estimated"
+SIZE_RATIO = 3.0  # mean radii of one object, estimated twice, differ by less than this factor
+
+
+@dataclass(frozen=True)
+class AssociationSettings(Settings):
+    association: str = setting(
+        ESTIMATED, "identities of boxes: estimated, or given by their object_id", choices=(ESTIMATED, GIVEN)
+    )
+    gate: float = setting(0.99, "probability that a box of the landmark passes the gate", low=0.5, high=0.9999)
+    min_overlap: float = setting(
+        0.2, "intersection over union of predicted and measured box", low=0.0, high=1.0
+    )
+    votes: int = setting(3, "keyframes that must agree before a track is bound to a landmark", low=1)
+    model_error: float = setting(
+        0.1, "error of the ellipsoid as a model of the object, as a share of its box", low=0.0, high=1.0
+    )
+    wrong_class: float = setting(0.05, "share of boxes that carry a wrong class", low=1e-6, high=0.5)
+    merge_distance: float = setting(
+        0.7, "distance of two centres below which they are one object, as a share of the sum of their radii", low=0.0
+    )
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """The box (4,) [px] that a landmark predicts and its covariance (4, 4) without that of the measurement."""
+
+    landmark: int
+    corners: Array
+    covariance: Array
+    class_id: str
+
+
+def predict(
+    T_map_camera: Array,
+    quadric: Array,
+    covariance: Array,
+    K: Array,
+    box: BoxMeasurement,
+    model_error: float,
+) -> tuple[Array, Array] | None:
+    """Predicted corners (4,) and their covariance (4, 4) [px^2]; None if the quadric is not in front.
+
+    Args:
+        T_map_camera: (4, 4).
+        quadric: (9,) centre and logarithmic shape.
+        covariance: (15, 15) of pose and quadric together.
+        K: (3, 3) camera matrix [px].
+        box: the measurement it is for: its image borders and cut edges.
+        model_error: see `AssociationSettings`.
+    """
+    visible, corners, J = box_of_visible_part(T_map_camera, quadric, K, box.bounds, box.clip)
+    if not visible:
+        return None
+    size = corners[2:] - corners[:2]
+    own = np.diag(np.tile(model_error * size, 2) ** 2)
+    return corners, J @ covariance @ J.T + own
+
+
+def distances(predictions: list[Prediction], boxes: list[BoxMeasurement], classes: list[str],
+              settings: AssociationSettings) -> Array:  # fmt: skip
+    """Negative log-likelihood (landmarks, boxes) of a pair; infinite outside the gate."""
+    gate = chi2.ppf(settings.gate, 4)
+    result = np.full((len(predictions), len(boxes)), np.inf)
+    for b, box in enumerate(boxes):
+        measured = np.linalg.inv(box.whitener.T @ box.whitener)
+        for p, prediction in enumerate(predictions):
+            if overlap(prediction.corners[None], box.corners[None])[0, 0] < settings.min_overlap:
+                continue
+            S = prediction.covariance + measured
+            difference = box.corners - prediction.corners
+            squared = difference @ np.linalg.solve(S, difference)
+            if squared < gate:
+                class_odds = 0.0 if prediction.class_id == classes[b] else -np.log(settings.wrong_class)
+                result[p, b] = 0.5 * (squared + np.linalg.slogdet(S)[1]) + class_odds
+    return result
+
+
+def assign(cost: Array) -> list[tuple[int, int]]:
+    """The pairs (row, column) of the cheapest one-to-one assignment; infinite costs are never taken."""
+    if not np.isfinite(cost).any():
+        return []
+    forbidden = np.abs(cost[np.isfinite(cost)]).sum() * 2.0 + 1e6
+    pairs = zip(*linear_sum_assignment(np.where(np.isfinite(cost), cost, forbidden)), strict=True)
+    return [(int(r), int(c)) for r, c in pairs if np.isfinite(cost[r, c])]
+
+
+class Votes:
+    """For each open track, how often which landmark was its best match."""
+
+    def __init__(self, needed: int) -> None:
+        self._needed = needed
+        self._votes: dict[int, Counter[int]] = {}
+
+    def add(self, track: int, landmark: int) -> int | None:
+        """A vote; returns the landmark once it is decided: enough votes, and twice those of all others."""
+        votes = self._votes.setdefault(track, Counter())
+        votes[landmark] += 1
+        others = votes.total() - votes[landmark]
+        return landmark if votes[landmark] >= max(self._needed, 2 * others) else None
+
+    def forget(self, track: int) -> None:
+        """The track is decided."""
+        self._votes.pop(track, None)
+
+
+def same_object(a: Ellipsoid, b: Ellipsoid, merge_distance: float) -> bool:
+    """Whether two ellipsoids are so close, and so alike in size, that they are one object."""
+    distance = float(np.linalg.norm(a.T_world_object[:3, 3] - b.T_world_object[:3, 3]))
+    sizes = [float(np.exp(np.log(ellipsoid.radii).mean())) for ellipsoid in (a, b)]
+    return distance < merge_distance * sum(sizes) and max(sizes) < SIZE_RATIO * min(sizes)

@@ -1,0 +1,101 @@
+"""The factor between a camera pose, a quadric and a measured box (document, eq. 4.3.3).
+
+A detector errs in two ways: a little, as its covariance says, and grossly (wrong object, half of it hidden). So
+the squared Mahalanobis distance q = r^T Sigma^-1 r of a box does not enter as it is, but as the negative
+log-likelihood of a heavy-tailed (multivariate Cauchy-like) distribution, rho(q) = k^2 log(1 + q / k^2), which is
+q for a good box and grows ever more slowly for a bad one. The four edges of a box share one q: gross errors concern
+the whole box.
+
+The factor's error is e = r sqrt(rho / q), so that |e|^2 = rho, and its Jacobian is the exact derivative of that:
+batch and incremental optimisers, and numerical derivatives, all see one and the same function.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import gtsam
+import numba
+import numpy as np
+from calibslam_msgs_py.measurements import Array
+
+from calibslam_backend.box_measurement import BoxMeasurement
+from calibslam_backend.quadric import DIMENSION, POSE, QUADRIC, box_of_visible_part
+
+# Mahalanobis distance that an ellipsoid counts for which has no box, being behind or around the camera. It is
+# constant: such a state is neither attractive nor does it pull; priors hold the landmark until it is seen again.
+INVISIBLE = 10.0
+
+
+@numba.njit(cache=True)
+def whitened_residual(T_map_camera, quadric, K, corners, whitener, bounds, clip):  # type: ignore[no-untyped-def]
+    """(visible, r (4,), dr (4, 15)): predicted minus measured box in units of its standard deviation."""
+    visible, box, jacobian = box_of_visible_part(T_map_camera, quadric, K, bounds, clip)
+    return visible, whitener @ (box - corners), whitener @ jacobian
+
+
+@numba.njit(cache=True)
+def robust_loss(q, k):  # type: ignore[no-untyped-def]
+    """rho(q) = k^2 log(1 + q / k^2) and its derivative, the weight of the box."""
+    return k * k * np.log1p(q / (k * k)), 1.0 / (1.0 + q / (k * k))
+
+
+@numba.njit(cache=True)
+def robust_residual(T_map_camera, quadric, K, corners, whitener, bounds, clip, k, jacobian):  # type: ignore[no-untyped-def]
+    """The factor's error (4,); writes its derivative to `jacobian` (4, 15), columns as in `quadric`."""
+    visible, r, dr = whitened_residual(T_map_camera, quadric, K, corners, whitener, bounds, clip)
+    if not visible:
+        jacobian[:] = 0.0
+        rho, _ = robust_loss(INVISIBLE**2, k)
+        r[:] = 0.5 * np.sqrt(rho)
+        return r
+    q = r @ r
+    if q < 1e-8:  # e = r (1 - q / 4k^2 ...)
+        jacobian[:] = dr
+        return r
+    rho, weight = robust_loss(q, k)
+    scale = np.sqrt(rho / q)
+    d_scale = (weight * q - rho) / (2.0 * scale * q * q)
+    for column in range(DIMENSION):
+        d_q = 2.0 * (r[0] * dr[0, column] + r[1] * dr[1, column] + r[2] * dr[2, column] + r[3] * dr[3, column])
+        for row in range(4):
+            jacobian[row, column] = scale * dr[row, column] + d_scale * d_q * r[row]
+    return scale * r
+
+
+_UNIT = gtsam.noiseModel.Unit.Create(4)
+
+
+def box_factor(
+    pose: int, quadric: int, box: BoxMeasurement, K: Array, robust_scale: float
+) -> gtsam.CustomFactor:
+    """The factor for one box.
+
+    Args:
+        pose: key of a Pose3, T_map_camera.
+        quadric: key of a (9,) vector (t, L), see `quadric`.
+        box: what was measured.
+        K: (3, 3) camera matrix [px].
+        robust_scale: k, the Mahalanobis distance from which a box counts as doubtful.
+    """
+    corners, whitener, bounds, clip = (np.ascontiguousarray(a) for a in vars(box).values())
+    jacobian = np.empty((4, DIMENSION))
+
+    def error(_: gtsam.CustomFactor, values: gtsam.Values, H: list[Array] | None) -> Array:
+        e: Array = robust_residual(
+            values.atPose3(pose).matrix(),
+            values.atVector(quadric),
+            K,
+            corners,
+            whitener,
+            bounds,
+            clip,
+            robust_scale,
+            jacobian,
+        )
+        if H is not None:
+            H[0], H[1] = jacobian[:, POSE], jacobian[:, QUADRIC]
+        return e
+
+    handler: Callable[[gtsam.CustomFactor, gtsam.Values, list[Array] | None], Array] = error
+    return gtsam.CustomFactor(_UNIT, [pose, quadric], handler)

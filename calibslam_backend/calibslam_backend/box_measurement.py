@@ -1,0 +1,63 @@
+"""A measured box, made ready for estimation: undistorted, whitened, its edges at the image border marked."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from calibslam_msgs_py.measurements import Array, Boxes, Camera
+from numpy.typing import NDArray
+
+# A detector's edge this close to the border is an edge of the image, not of the object [px].
+BORDER = 2.0
+
+
+@dataclass(frozen=True)
+class BoxMeasurement:
+    """One box in the pinhole image.
+
+    Attributes:
+        corners: (4,) xmin ymin xmax ymax, undistorted [px].
+        whitener: (4, 4) W with W^T W the inverse covariance [1/px].
+        bounds: (4,) the image borders at this box, undistorted [px].
+        clip: (4,) bool, edges that lie on a border: the object reaches at least that far.
+    """
+
+    corners: Array
+    whitener: Array
+    bounds: Array
+    clip: NDArray[np.bool_]
+
+
+def undistorted(corners: Array, camera: Camera) -> Array:
+    """(N, 4) boxes in the distorted image -> (N, 4) in the pinhole image [px].
+
+    An edge of a box is a line that distortion bends. It is moved by its middle, near which the outline of an
+    ellipsoid touches it.
+    """
+    if not np.any(camera.distortion) or not len(corners):
+        return corners.copy()
+    x = 0.5 * (corners[:, 0] + corners[:, 2])
+    y = 0.5 * (corners[:, 1] + corners[:, 3])
+    middles = np.stack([corners[:, 0], y, x, corners[:, 1], corners[:, 2], y, x, corners[:, 3]], axis=1)
+    points = cv2.undistortPoints(middles.reshape(-1, 1, 2), camera.K, camera.distortion, P=camera.K)
+    points = points.reshape(-1, 4, 2)
+    return np.stack([points[:, 0, 0], points[:, 1, 1], points[:, 2, 0], points[:, 3, 1]], axis=1)
+
+
+def prepare(boxes: Boxes, covariances: Array, camera: Camera) -> list[BoxMeasurement]:
+    """The boxes of one image with the covariances (N, 4, 4) [px^2] to be used for them."""
+    corners = undistorted(boxes.corners, camera)
+    image = np.array([0.0, 0.0, camera.width, camera.height])
+    x = 0.5 * (boxes.corners[:, 0] + boxes.corners[:, 2])
+    y = 0.5 * (boxes.corners[:, 1] + boxes.corners[:, 3])
+    zero = np.zeros(len(boxes))
+    # The border beside each box: a box as wide and high as the image, around the middle of this one.
+    vertical = undistorted(np.stack([zero, 2 * y - image[3], zero + image[2], image[3] + zero], axis=1), camera)
+    horizontal = undistorted(np.stack([2 * x - image[2], zero, image[2] + zero, zero + image[3]], axis=1), camera)
+    bounds = np.stack([vertical[:, 0], horizontal[:, 1], vertical[:, 2], horizontal[:, 3]], axis=1)
+    low, high = boxes.corners[:, :2] <= BORDER, boxes.corners[:, 2:] >= image[2:] - BORDER
+    clip = np.concatenate([low, high], axis=1)
+    whiteners = np.linalg.inv(np.linalg.cholesky(covariances))
+    return [BoxMeasurement(*each) for each in zip(corners, whiteners, bounds, clip, strict=True)]

@@ -1,0 +1,308 @@
+"""The factor graph of camera poses and quadrics, solved incrementally by ISAM2 (document, eq. 2.3.5 and 4.3.3).
+
+Keys: x(k) pose of keyframe k; q(j) quadric j, a vector of centre and logarithmic shape (see `quadric`).
+
+A graph never stays broken. A quadric that runs away is taken out, an update that fails is repaired by building
+the tree anew without the quadric at fault, and both are reported.
+"""
+
+from __future__ import annotations
+
+import logging
+import re
+from dataclasses import dataclass, field
+
+import gtsam
+import numpy as np
+from calibslam_msgs_py.measurements import Array
+from calibslam_msgs_py.settings import Settings, setting
+from gtsam import symbol
+
+from calibslam_backend.box_factor import box_factor
+from calibslam_backend.box_measurement import BoxMeasurement
+from calibslam_backend.initialisation import Initialised, InitialisationSettings
+from calibslam_backend.quadric import Ellipsoid
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class GraphSettings(Settings):
+    robust_scale: float = setting(
+        2.0, "Mahalanobis distance from which a box counts as doubtful", low=0.1, high=1e6
+    )
+    robust_odometry: float = setting(
+        3.0, "Mahalanobis distance from which a motion counts as doubtful", low=0.1, high=1e6
+    )
+    prior_sigma: float = setting(0.001, "first pose: it is the map's origin", unit="rad and m", low=1e-6)
+    relinearise_every: int = setting(10, "keyframes between relinearisations of the whole graph", low=1)
+    relinearise_pose: float = setting(0.05, "change of a pose that asks for one", unit="rad and m", low=0.0)
+    relinearise_quadric: float = setting(0.1, "change of a quadric that asks for one", unit="m and log m", low=0.0)
+    young: int = setting(20, "keyframes during which a quadric is relinearised at once", low=0)
+
+
+@dataclass
+class Landmark:
+    """What the graph knows of a quadric: its first guess, its boxes by keyframe, its factors."""
+
+    first: Initialised
+    born: int
+    boxes: list[tuple[int, BoxMeasurement]] = field(default_factory=list)
+    factors: list[int] = field(default_factory=list)
+
+
+@dataclass(frozen=True)
+class UpdateReport:
+    """What an update did: quadrics that were taken out by id, and the reason if the tree was built anew."""
+
+    removed: list[int]
+    repaired: str = ""
+
+
+class ObjectGraph:
+    """Poses x(0..n-1) in order, quadrics by id."""
+
+    # A quadric beyond these is no object any more [m].
+    LARGEST_RADIUS, LARGEST_DISTANCE, SMALLEST_RADIUS = 10.0, 200.0, 1e-4
+
+    def __init__(self, K: Array, settings: GraphSettings, priors: InitialisationSettings) -> None:
+        self._K = np.ascontiguousarray(K, float)
+        self._settings = settings
+        self._sigmas = priors.prior_sigmas()
+        self._motions: list[tuple[Array, Array]] = []  # between consecutive poses, with covariance
+        self.landmarks: dict[int, Landmark] = {}
+        self._origin = gtsam.Pose3()
+        self._isam = self._new_isam()
+        self._begin_change()
+        self._values = gtsam.Values()
+        self._updates = 0
+
+    # -- what is in it ------------------------------------------------------------------------------------------
+
+    @property
+    def size(self) -> int:
+        """Number of poses, those still to be updated included."""
+        return len(self._motions) + (1 if self._has_origin else 0)
+
+    def pose(self, k: int) -> Array:
+        """(4, 4) T_map_camera of keyframe k."""
+        return np.asarray(self._values.atPose3(symbol("x", k)).matrix())
+
+    def poses(self) -> Array:
+        """(N, 4, 4) of all keyframes."""
+        return np.stack([self.pose(k) for k in range(self.size)]) if self.size else np.empty((0, 4, 4))
+
+    def quadric(self, j: int) -> Array:
+        """(9,) centre and logarithmic shape."""
+        return np.asarray(self._values.atVector(symbol("q", j)))
+
+    def pose_covariance(self, k: int) -> Array:
+        """(6, 6) [rotation, translation] of keyframe k in its body."""
+        return np.asarray(self._isam.marginalCovariance(symbol("x", k)))
+
+    def quadric_covariance(self, j: int) -> Array:
+        """(9, 9) of the vector of quadric j."""
+        return np.asarray(self._isam.marginalCovariance(symbol("q", j)))
+
+    def joint_covariance(self, k: int, j: int) -> Array:
+        """(15, 15) of pose k and quadric j: columns of `quadric.box_of_visible_part`."""
+        keys = [symbol("x", k), symbol("q", j)]
+        joint = self._isam.jointMarginalCovariance(keys)
+        return np.block([[joint.at(a, b) for b in keys] for a in keys])
+
+    # -- changes, which take effect with the next update --------------------------------------------------------
+
+    def add_origin(self) -> None:
+        """The first pose."""
+        self._has_origin = True
+        self._add_origin_factor()
+
+    def add_pose(self, motion: Array, covariance: Array, guess: Array) -> int:
+        """The next pose, after a motion (4, 4) from the last one with covariance (6, 6); returns its number.
+
+        The optimisation starts from `guess` (4, 4), its pose in the map.
+        """
+        k = self.size
+        self._motions.append((motion, covariance))
+        self._add_motion_factor(k)
+        for values in (self._new_values, self._values):
+            values.insert(symbol("x", k), gtsam.Pose3(guess))
+        return k
+
+    def add_quadric(self, j: int, first: Initialised, boxes: list[tuple[int, BoxMeasurement]]) -> None:
+        """A new quadric with the boxes (keyframe, box) seen of it so far."""
+        self.landmarks[j] = Landmark(first, self.size)
+        for values in (self._new_values, self._values):
+            values.insert(symbol("q", j), first.vector)
+        self._add_prior_factors(j)
+        for k, box in boxes:
+            self.add_box(k, j, box)
+
+    def add_box(self, k: int, j: int, box: BoxMeasurement) -> None:
+        """A box of quadric j in keyframe k."""
+        self.landmarks[j].boxes.append((k, box))
+        self._add_box_factor(k, j, box)
+
+    def remove_quadric(self, j: int) -> None:
+        """Take a quadric out, with all that was measured of it."""
+        landmark = self.landmarks.pop(j)
+        if symbol("q", j) in self._new_values.keys():
+            raise ValueError(f"quadric {j} was added in the same update")
+        self._to_remove += landmark.factors
+        self._values.erase(symbol("q", j))
+
+    # -- solving ------------------------------------------------------------------------------------------------
+
+    def update(self, everything: bool = False) -> UpdateReport:
+        """One step of ISAM2; `everything` relinearises whatever has moved."""
+        self._updates += 1
+        repaired = ""
+        try:
+            self._step(everything or self._updates % self._settings.relinearise_every == 0)
+        except RuntimeError as error:
+            repaired = self._repair(error)
+        removed = [j for j in self.landmarks if not self._sane(j)]
+        if removed:
+            for j in removed:
+                log.warning("quadric %d ran away and was taken out", j)
+                self.remove_quadric(j)
+            try:
+                self._step(False)
+            except RuntimeError as error:
+                repaired = self._repair(error)
+        return UpdateReport(removed, repaired)
+
+    def factors(self) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
+        """The whole graph and the current estimate, for a batch optimiser."""
+        graph = gtsam.NonlinearFactorGraph()
+        held = self._isam.getFactorsUnsafe()
+        for i in range(held.size()):
+            if held.exists(i):
+                graph.push_back(held.at(i))
+        return graph, gtsam.Values(self._values)
+
+    def _step(self, everything: bool) -> None:
+        changes = gtsam.ISAM2UpdateParams()
+        changes.removeFactorIndices = self._to_remove
+        changes.constrainedKeys = self._order()
+        changes.force_relinearize = True
+        if not everything:
+            changes.noRelinKeys = self._settled()
+        result = self._isam.update(self._new_factors, self._new_values, changes)
+        for owner, index in zip(self._owners, result.getNewFactorsIndices(), strict=True):
+            if owner in self.landmarks:
+                self.landmarks[owner].factors.append(index)
+        self._begin_change()
+        self._values = self._isam.calculateEstimate()
+
+    def _order(self) -> gtsam.KeyGroupMap:
+        """Quadrics and the newest pose are eliminated last: the next update will touch them again."""
+        groups = gtsam.KeyGroupMap()
+        for j in self.landmarks:
+            groups.insert2(symbol("q", j), 1)
+        groups.insert2(symbol("x", self.size - 1), 1)
+        return groups
+
+    def _settled(self) -> gtsam.KeyList:
+        """Everything but young quadrics and the newest poses keeps its linearisation point for now."""
+        keys = gtsam.KeyList()
+        for k in range(self.size - 5):
+            keys.push_back(symbol("x", k))
+        for j, landmark in self.landmarks.items():
+            if self.size - landmark.born > self._settings.young:
+                keys.push_back(symbol("q", j))
+        return keys
+
+    def _sane(self, j: int) -> bool:
+        vector = self.quadric(j)
+        if not np.isfinite(vector).all():
+            return False
+        radii = Ellipsoid.from_vector(vector).radii
+        return bool(
+            self.SMALLEST_RADIUS < radii.min()
+            and radii.max() < self.LARGEST_RADIUS
+            and np.linalg.norm(vector[:3] - self.pose(self.size - 1)[:3, 3]) < self.LARGEST_DISTANCE
+        )
+
+    def _repair(self, error: RuntimeError) -> str:
+        """Build the tree anew from the last good estimate, without the quadric the error names, if it names one."""
+        named = re.search(r"Symbol: ([a-z])(\d+)", str(error))
+        reason = f"update failed near {named[1]}{named[2]}" if named else f"update failed: {error}"
+        suspects = {int(named[2])} if named and named[1] == "q" else set()
+        # A pose is held by odometry; where the error names one, the fault lies with a quadric it sees.
+        if named and named[1] == "x":
+            k = int(named[2])
+            suspects = {j for j, m in self.landmarks.items() if any(n == k for n, _ in m.boxes)}
+            suspects = {max(suspects, key=lambda j: self.landmarks[j].born)} if suspects else set()
+        log.warning("%s; rebuilding without quadrics %s", reason, sorted(suspects) or "removed")
+        for j in suspects & set(self.landmarks):
+            del self.landmarks[j]
+        self._isam = self._new_isam()
+        estimate = self._values
+        self._begin_change()
+        if not self._has_origin:
+            raise error
+        self._add_origin_factor(insert=False)
+        for k in range(1, self.size):
+            self._add_motion_factor(k)
+        for k in range(self.size):
+            self._new_values.insert(symbol("x", k), estimate.atPose3(symbol("x", k)))
+        for j, landmark in self.landmarks.items():
+            landmark.factors = []
+            self._new_values.insert(symbol("q", j), estimate.atVector(symbol("q", j)))
+            self._add_prior_factors(j)
+            for k, box in landmark.boxes:
+                self._add_box_factor(k, j, box)
+        try:
+            self._step(True)
+        except RuntimeError as again:
+            if not self.landmarks:
+                raise
+            return f"{reason}; {self._repair(again)}"
+        return reason
+
+    def _new_isam(self) -> gtsam.ISAM2:
+        parameters = gtsam.ISAM2Params()
+        parameters.relinearizeSkip = 1  # `update` says itself what may be relinearised
+        thresholds = gtsam.ISAM2ThresholdMap()
+        pose, quadric = self._settings.relinearise_pose, self._settings.relinearise_quadric
+        for name, size, threshold in (("x", 6, pose), ("q", 9, quadric)):
+            thresholds.insert((name, np.full(size, threshold)))
+        parameters.setRelinearizeThreshold(thresholds)
+        return gtsam.ISAM2(parameters)
+
+    # -- factors ------------------------------------------------------------------------------------------------
+
+    _has_origin = False
+
+    def _begin_change(self) -> None:
+        self._new_factors = gtsam.NonlinearFactorGraph()
+        self._new_values = gtsam.Values()
+        self._owners: list[int] = []  # of each new factor: the quadric, or -1
+        self._to_remove: list[int] = []
+
+    def _add(self, factor: gtsam.NonlinearFactor, owner: int = -1) -> None:
+        self._new_factors.push_back(factor)
+        self._owners.append(owner)
+
+    def _add_origin_factor(self, insert: bool = True) -> None:
+        noise = gtsam.noiseModel.Isotropic.Sigma(6, self._settings.prior_sigma)
+        self._add(gtsam.PriorFactorPose3(symbol("x", 0), self._origin, noise))
+        if insert:
+            self._new_values.insert(symbol("x", 0), self._origin)
+            self._values.insert(symbol("x", 0), self._origin)
+
+    def _add_motion_factor(self, k: int) -> None:
+        motion, covariance = self._motions[k - 1]
+        noise = gtsam.noiseModel.Robust.Create(
+            gtsam.noiseModel.mEstimator.Cauchy.Create(self._settings.robust_odometry),
+            gtsam.noiseModel.Gaussian.Covariance(covariance),
+        )
+        self._add(gtsam.BetweenFactorPose3(symbol("x", k - 1), symbol("x", k), gtsam.Pose3(motion), noise))
+
+    def _add_prior_factors(self, j: int) -> None:
+        noise = gtsam.noiseModel.Diagonal.Sigmas(self._sigmas)
+        self._add(gtsam.PriorFactorVector(symbol("q", j), self.landmarks[j].first.vector, noise), j)
+
+    def _add_box_factor(self, k: int, j: int, box: BoxMeasurement) -> None:
+        self._add(box_factor(symbol("x", k), symbol("q", j), box, self._K, self._settings.robust_scale), j)

@@ -1,0 +1,83 @@
+"""Where a new keyframe is, given odometry and the boxes of quadrics that are already in the map.
+
+Odometry fails grossly now and then, and so do boxes. Both losses are heavy-tailed, hence have several minima, and
+an optimiser started at odometry's prediction would stay with odometry. So the pose is sought twice, once from
+there and once from where the boxes alone would put it, and the better one starts the keyframe.
+"""
+
+from __future__ import annotations
+
+import gtsam
+import numba
+import numpy as np
+from calibslam_msgs_py.measurements import Array
+
+from calibslam_backend.box_factor import INVISIBLE, robust_loss, whitened_residual
+from calibslam_backend.box_measurement import BoxMeasurement
+
+# The second start believes odometry this much less: its standard deviations times ten.
+DISTRUST = 10.0
+ITERATIONS = 15
+
+
+def localise(
+    predicted: Array,
+    covariance: Array,
+    quadrics: list[Array],
+    boxes: list[BoxMeasurement],
+    K: Array,
+    robust_scale: float,
+    robust_odometry: float,
+) -> Array:
+    """Pose (4, 4) of the camera in the map.
+
+    Args:
+        predicted: (4, 4) last pose and odometry.
+        covariance: (6, 6) of the odometry since the last pose, [rotation, translation].
+        quadrics: N vectors (9,) in the map, taken as exact.
+        boxes: their N boxes.
+        K: (3, 3) camera matrix [px].
+        robust_scale, robust_odometry: as in the factor graph.
+    """
+    if not boxes:
+        return predicted
+    whitener = np.linalg.inv(np.linalg.cholesky(covariance))
+    measured = [np.stack([getattr(b, n) for b in boxes]) for n in ("corners", "whitener", "bounds", "clip")]
+    vectors = np.stack(quadrics)
+    first = gtsam.Pose3(predicted)
+
+    def minimise(pose: gtsam.Pose3, W: Array, k: float) -> tuple[float, gtsam.Pose3]:
+        damping, best, cost, A, b = 1e-3, pose, np.inf, np.eye(6), np.zeros(6)
+        for _ in range(ITERATIONS):
+            e = W @ gtsam.Pose3.Logmap(first.between(pose))
+            rho, weight = robust_loss(e @ e, k)
+            H, g = weight * W.T @ W, -weight * W.T @ e
+            c = rho + _boxes(pose.matrix(), vectors, K, *measured, robust_scale, H, g)
+            if c <= cost:
+                done = cost - c < 1e-3 * c
+                best, cost, A, b, damping = pose, c, H, g, max(damping / 10.0, 1e-6)
+                if done:
+                    break
+            else:
+                damping *= 10.0
+            pose = best.retract(np.linalg.solve(A + damping * np.diag(np.diag(A)), b))
+        return cost, best
+
+    _, guess = minimise(first, whitener / DISTRUST, 1e6)
+    results = [minimise(start, whitener, robust_odometry) for start in (first, guess)]
+    return np.asarray(min(results, key=lambda result: result[0])[1].matrix())
+
+
+@numba.njit(cache=True)
+def _boxes(T, vectors, K, corners, whiteners, bounds, clip, k, H, g):  # type: ignore[no-untyped-def]
+    """Robust cost of the boxes; adds their normal equations to H (6, 6) and g (6,)."""
+    cost = 0.0
+    for n in range(len(vectors)):
+        visible, r, dr = whitened_residual(T, vectors[n], K, corners[n], whiteners[n], bounds[n], clip[n])
+        rho, weight = robust_loss(r @ r if visible else INVISIBLE**2, k)
+        cost += rho
+        if visible:
+            J = np.ascontiguousarray(dr[:, :6])
+            H += weight * (J.T @ J)
+            g -= weight * (J.T @ r)
+    return cost

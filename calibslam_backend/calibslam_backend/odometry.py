@@ -1,0 +1,187 @@
+"""Relative motions from odometry, and what is believed of them.
+
+Odometry covariances are often missing. `MotionNoise` then stands in: a share of the motion itself plus a floor,
+which is what frame-to-frame visual odometry was seen to do on recordings of slow and fast motion alike.
+"""
+
+from __future__ import annotations
+
+from bisect import bisect_right
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+from calibslam_msgs_py.measurements import Array, InvalidMeasurement, RelativeMotion
+from calibslam_msgs_py.settings import Settings, setting
+
+SECOND = 1_000_000_000  # [ns]
+
+
+@dataclass(frozen=True)
+class MotionNoise(Settings):
+    """Standard deviations of a motion whose covariance is unknown: sqrt(floor^2 + (share * motion)^2)."""
+
+    rotation_floor: float = setting(0.001, "unknown odometry noise: rotation at rest", unit="rad", low=1e-6)
+    rotation_share: float = setting(0.04, "unknown odometry noise: share of the rotation", low=0.0, high=1.0)
+    translation_floor: float = setting(0.001, "unknown odometry noise: translation at rest", unit="m", low=1e-6)
+    translation_share: float = setting(0.06, "unknown odometry noise: share of the translation", low=0.0, high=1.0)
+
+    def covariance(self, T_start_end: Array) -> Array:
+        """(6, 6) [rotation, translation] for a motion (4, 4)."""
+        motion = gtsam.Pose3.Logmap(gtsam.Pose3(T_start_end))
+        rotation = np.hypot(self.rotation_floor, self.rotation_share * np.linalg.norm(motion[:3]))
+        translation = np.hypot(self.translation_floor, self.translation_share * np.linalg.norm(motion[3:]))
+        return np.diag(np.repeat([rotation, translation], 3) ** 2)
+
+
+class OdometryDifferencer:
+    """Differences of consecutive poses of an odometry source: the only thing it measures."""
+
+    def __init__(self) -> None:
+        self._stamp: int | None = None
+        self._T: Array | None = None
+
+    def add(
+        self,
+        stamp: int,
+        T_odom_body: Array,
+        twist: Array | None = None,
+        twist_covariance: Array | None = None,
+        frame_id: str = "camera",
+    ) -> RelativeMotion | None:
+        """The motion since the last pose; None for the first.
+
+        Args:
+            stamp: time [ns].
+            T_odom_body: (4, 4).
+            twist: (6,) linear [m/s] and angular [rad/s] velocity in the body; not needed, checked if given.
+            twist_covariance: (6, 6) of the twist over the step that ends here, in ROS order (linear, angular):
+                the motion has this covariance times the step's duration squared. None or zeros: unknown.
+            frame_id: name of the body.
+
+        Raises:
+            InvalidMeasurement: "not_finite", "not_a_rotation", "covariance" or "time_backwards". After a jump of
+                time backwards the next motion starts at the new time.
+        """
+        R = T_odom_body[:3, :3]
+        if not np.isfinite(T_odom_body).all() or (twist is not None and not np.isfinite(twist).all()):
+            raise InvalidMeasurement("not_finite", f"odometry at {stamp} ns is not finite")
+        if not np.allclose(R @ R.T, np.eye(3), atol=1e-3):
+            raise InvalidMeasurement("not_a_rotation", f"odometry at {stamp} ns has an invalid orientation")
+        covariance = None
+        if twist_covariance is not None and np.any(twist_covariance):
+            order = [3, 4, 5, 0, 1, 2]
+            covariance = np.asarray(twist_covariance, float)[np.ix_(order, order)]
+            if not np.isfinite(covariance).all() or np.linalg.eigvalsh(covariance)[0] <= 0.0:
+                raise InvalidMeasurement("covariance", f"twist covariance at {stamp} ns is not positive definite")
+        last_stamp, last_T = self._stamp, self._T
+        if last_stamp is not None and stamp == last_stamp:
+            raise InvalidMeasurement("duplicate", f"odometry at {stamp} ns came twice")
+        self._stamp, self._T = stamp, T_odom_body
+        if last_stamp is None or last_T is None:
+            return None
+        if stamp < last_stamp:
+            raise InvalidMeasurement("time_backwards", f"odometry jumped from {last_stamp} back to {stamp} ns")
+        if covariance is not None:
+            covariance = covariance * ((stamp - last_stamp) / SECOND) ** 2
+        return RelativeMotion(last_stamp, stamp, np.linalg.inv(last_T) @ T_odom_body, covariance, frame_id)
+
+
+class MotionChain:
+    """Consecutive relative motions of the camera, readable between any two times.
+
+    Times inside a step are interpolated along the geodesic, its covariance in proportion.
+    """
+
+    # What a body may do unseen while odometry is missing: 1 rad/s and 1 m/s.
+    UNSEEN_MOTION = 1.0
+
+    def __init__(self, noise: MotionNoise, T_body_camera: Array) -> None:
+        self._noise = noise
+        self._extrinsic = gtsam.Pose3(T_body_camera)
+        self._times: list[int] = []  # ends of steps; the first is the start of the chain
+        self._poses: list[gtsam.Pose3] = []  # camera in the chain's own frame, at those times
+        self._covariances: list[Array | None] = []  # of the step that ends there
+
+    @property
+    def start(self) -> int | None:
+        """First time it knows [ns]."""
+        return self._times[0] if self._times else None
+
+    @property
+    def end(self) -> int | None:
+        """Last time it knows [ns]."""
+        return self._times[-1] if self._times else None
+
+    def add(self, motion: RelativeMotion) -> bool:
+        """Append a motion of the body; False if odometry was missing before it and a gap was bridged.
+
+        Raises:
+            InvalidMeasurement: "not_finite", "covariance", "time_backwards" or "overlap".
+        """
+        if not np.isfinite(motion.T_start_end).all():
+            raise InvalidMeasurement("not_finite", f"motion ending at {motion.end} ns is not finite")
+        if motion.end <= motion.start:
+            raise InvalidMeasurement("time_backwards", f"motion from {motion.start} to {motion.end} ns ends first")
+        covariance = motion.covariance
+        if covariance is not None:
+            if not np.isfinite(covariance).all() or np.linalg.eigvalsh(covariance)[0] <= 0.0:
+                raise InvalidMeasurement("covariance", f"covariance at {motion.end} ns is not positive definite")
+            to_camera = self._extrinsic.inverse().AdjointMap()
+            covariance = to_camera @ covariance @ to_camera.T
+        if not self._times:
+            self._append(motion.start, gtsam.Pose3(), None)
+        last = self._times[-1]
+        if motion.start < last:
+            raise InvalidMeasurement(
+                "overlap", f"motion from {motion.start} to {motion.end} ns starts before {last} ns, the last one's end"
+            )
+        contiguous = motion.start == last
+        if not contiguous:
+            unseen = np.eye(6) * (self.UNSEEN_MOTION * (motion.start - last) / SECOND) ** 2
+            self._append(motion.start, self._poses[-1], unseen)
+        step = self._extrinsic.inverse() * gtsam.Pose3(motion.T_start_end) * self._extrinsic
+        self._append(motion.end, self._poses[-1] * step, covariance)
+        return contiguous
+
+    def between(self, start: int, end: int) -> tuple[Array, Array]:
+        """Motion (4, 4) of the camera and its covariance (6, 6) [rotation, translation] from start to end [ns].
+
+        Both times must lie inside the chain.
+        """
+        first, last = self._pose_at(start), self._pose_at(end)
+        motion = first.between(last)
+        covariance = np.zeros((6, 6))
+        for i in range(bisect_right(self._times, start), len(self._times)):
+            begin, finish = max(start, self._times[i - 1]), min(end, self._times[i])
+            if begin >= end:
+                break
+            known = self._covariances[i]
+            if known is None:
+                return motion.matrix(), self._noise.covariance(motion.matrix())
+            share = (finish - begin) / (self._times[i] - self._times[i - 1])
+            to_end = last.inverse().compose(self._pose_at(finish)).AdjointMap()
+            covariance += to_end @ (share * known) @ to_end.T
+        return motion.matrix(), covariance
+
+    def forget_before(self, time: int) -> None:
+        """Drop what is not needed to read times from `time` [ns] on."""
+        keep = max(bisect_right(self._times, time) - 1, 0)
+        del self._times[:keep], self._poses[:keep], self._covariances[:keep]
+
+    def clear(self) -> None:
+        """Forget everything."""
+        del self._times[:], self._poses[:], self._covariances[:]
+
+    def _append(self, time: int, pose: gtsam.Pose3, covariance: Array | None) -> None:
+        self._times.append(time)
+        self._poses.append(pose)
+        self._covariances.append(covariance)
+
+    def _pose_at(self, time: int) -> gtsam.Pose3:
+        i = bisect_right(self._times, time) - 1
+        if i == len(self._times) - 1:
+            return self._poses[i]
+        share = (time - self._times[i]) / (self._times[i + 1] - self._times[i])
+        step = gtsam.Pose3.Logmap(self._poses[i].between(self._poses[i + 1]))
+        return self._poses[i].compose(gtsam.Pose3.Expmap(share * step))

@@ -1,0 +1,117 @@
+"""Boxes of the same object in consecutive images.
+
+Over a few images boxes of one object overlap, once the camera's rotation is undone; that is enough to link them
+into tracks. Which landmark a track belongs to is decided elsewhere, with more evidence.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass, field
+
+import numpy as np
+from calibslam_msgs_py.measurements import Array
+from calibslam_msgs_py.settings import Settings, setting
+from scipy.optimize import linear_sum_assignment
+
+from calibslam_backend.odometry import SECOND
+
+
+@dataclass(frozen=True)
+class TrackingSettings(Settings):
+    min_overlap: float = setting(0.3, "intersection over union of a track's last box and its next", low=0.0, high=1.0)
+    max_gap: float = setting(0.5, "time after which an unseen track ends", unit="s", low=0.0)
+    duplicate_overlap: float = setting(
+        0.75, "two boxes of one image that overlap more are one object", low=0.0, high=1.0
+    )
+
+
+@dataclass
+class Track:
+    """One object over consecutive images: `corners` (4,) at `stamp` [ns], and how often it had which class."""
+
+    id: int
+    stamp: int
+    corners: Array
+    classes: Counter[str] = field(default_factory=Counter)
+
+    @property
+    def class_id(self) -> str:
+        """The class most of its boxes carry."""
+        return self.classes.most_common(1)[0][0]
+
+
+def overlap(a: Array, b: Array) -> Array:
+    """Intersection over union (N, M) of boxes (N, 4) and (M, 4) [px]."""
+    low = np.maximum(a[:, None, :2], b[None, :, :2])
+    high = np.minimum(a[:, None, 2:], b[None, :, 2:])
+    shared = np.clip(high - low, 0.0, None).prod(axis=2)
+    areas = [(boxes[:, 2:] - boxes[:, :2]).prod(axis=1) for boxes in (a, b)]
+    return np.asarray(shared / (areas[0][:, None] + areas[1][None, :] - shared))
+
+
+def unique(corners: Array, scores: Array, max_overlap: float) -> Array:
+    """Indices of the boxes (N, 4) that remain when of each overlapping pair the one of lower score goes."""
+    kept: list[int] = []
+    overlaps = overlap(corners, corners)
+    for i in np.argsort(-scores, kind="stable"):
+        if all(overlaps[i, j] <= max_overlap for j in kept):
+            kept.append(int(i))
+    return np.array(sorted(kept), dtype=int)
+
+
+def rotated(corners: Array, R_now_before: Array, K: Array) -> Array:
+    """Where boxes (N, 4) [px] appear after the camera has turned; infinitely far objects, corners' centre and size."""
+    H = K @ R_now_before @ np.linalg.inv(K)
+    x, y = 0.5 * (corners[:, 0] + corners[:, 2]), 0.5 * (corners[:, 1] + corners[:, 3])
+    p = np.stack([x, y, np.ones_like(x)], axis=1) @ H.T
+    shift = p[:, :2] / np.maximum(p[:, 2:], 0.1) - np.stack([x, y], axis=1)
+    return corners + np.concatenate([shift, shift], axis=1)
+
+
+class Tracker:
+    """Links boxes to tracks, image by image."""
+
+    # A box of another class than its track is possible, but must overlap that much more.
+    CLASS_CHANGE = 0.2
+
+    def __init__(self, settings: TrackingSettings, K: Array) -> None:
+        self._settings = settings
+        self._K = K
+        self._next_id = 0
+        self.tracks: list[Track] = []
+
+    def update(self, stamp: int, corners: Array, class_ids: tuple[str, ...], R_now_before: Array) -> list[Track]:
+        """The track of each box (N, 4) [px], in their order.
+
+        Args:
+            stamp: of the image [ns].
+            corners: of the boxes, undistorted.
+            class_ids: N.
+            R_now_before: (3, 3) rotation of the camera from the previous image to this one.
+        """
+        oldest = stamp - int(self._settings.max_gap * SECOND)
+        self.tracks = [track for track in self.tracks if track.stamp >= oldest]
+        if self.tracks:
+            moved = rotated(np.stack([track.corners for track in self.tracks]), R_now_before, self._K)
+            for track, box in zip(self.tracks, moved, strict=True):
+                track.corners = box
+        found: list[Track | None] = [None] * len(corners)
+        if self.tracks and len(corners):
+            score = overlap(np.stack([track.corners for track in self.tracks]), corners)
+            other = np.array([[track.class_id != c for c in class_ids] for track in self.tracks])
+            score = score - self.CLASS_CHANGE * other
+            for t, b in zip(*linear_sum_assignment(-np.maximum(score, 0.0)), strict=True):
+                if score[t, b] > self._settings.min_overlap:
+                    found[b] = self.tracks[t]
+        linked = [track or self._begin(stamp, box) for track, box in zip(found, corners, strict=True)]
+        for track, box, class_id in zip(linked, corners, class_ids, strict=True):
+            track.stamp, track.corners = stamp, box
+            track.classes[class_id] += 1
+        return linked
+
+    def _begin(self, stamp: int, corners: Array) -> Track:
+        track = Track(self._next_id, stamp, corners)
+        self._next_id += 1
+        self.tracks.append(track)
+        return track
