@@ -32,10 +32,10 @@ class SimulationSettings(Settings):
     frame_rate: float = setting(30.0, "images per second", unit="Hz", low=1.0)
     pace: float = setting(1.0, "speed of the camera; 1: as TUM fr3_office, 2: as fr1_desk", low=0.01)
     odometry_rotation: float = setting(
-        0.006, "standard deviation of the odometry's error per image, about each axis", unit="rad", low=1e-6
+        0.004, "standard deviation of the odometry's error per image, about each axis", unit="rad", low=1e-6
     )
     odometry_translation: float = setting(
-        0.007, "standard deviation of the odometry's error per image, along each axis", unit="m", low=1e-6
+        0.006, "standard deviation of the odometry's error per image, along each axis", unit="m", low=1e-6
     )
     odometry_outliers: float = setting(
         0.0, "share of odometry steps that fail, with ten times the stated error", low=0.0, high=1.0
