@@ -12,14 +12,14 @@ from collections import Counter
 from dataclasses import dataclass
 
 import numpy as np
-from calibslam_msgs_py.measurements import Array
-from calibslam_msgs_py.settings import Settings, setting
 from scipy.optimize import linear_sum_assignment
 from scipy.stats import chi2
 
 from calibslam_backend.box_measurement import BoxMeasurement
 from calibslam_backend.quadric import Ellipsoid, box_of_visible_part
 from calibslam_backend.tracking import overlap
+from calibslam_msgs_py.measurements import Array
+from calibslam_msgs_py.settings import Settings, setting
 
 GIVEN, ESTIMATED = "given", "estimated"
 SIZE_RATIO = 3.0  # mean radii of one object, estimated twice, differ by less than this factor
@@ -31,16 +31,16 @@ class AssociationSettings(Settings):
         ESTIMATED, "identities of boxes: estimated, or given by their object_id", choices=(ESTIMATED, GIVEN)
     )
     gate: float = setting(0.99, "probability that a box of the landmark passes the gate", low=0.5, high=0.9999)
-    min_overlap: float = setting(
-        0.2, "intersection over union of predicted and measured box", low=0.0, high=1.0
-    )
+    min_overlap: float = setting(0.2, "intersection over union of predicted and measured box", low=0.0, high=1.0)
     votes: int = setting(3, "keyframes that must agree before a track is bound to a landmark", low=1)
     model_error: float = setting(
         0.1, "error of the ellipsoid as a model of the object, as a share of its box", low=0.0, high=1.0
     )
     wrong_class: float = setting(0.05, "share of boxes that carry a wrong class", low=1e-6, high=0.5)
     merge_distance: float = setting(
-        0.7, "distance of two centres below which they are one object, as a share of the sum of their radii", low=0.0
+        0.7,
+        "distance of two centres below which they are one object, as a share of the sum of their radii",
+        low=0.0,
     )
 
 

@@ -17,10 +17,10 @@ from collections.abc import Callable
 import gtsam
 import numba
 import numpy as np
-from calibslam_msgs_py.measurements import Array
 
 from calibslam_backend.box_measurement import BoxMeasurement
 from calibslam_backend.quadric import DIMENSION, POSE, QUADRIC, box_of_visible_part
+from calibslam_msgs_py.measurements import Array
 
 # Mahalanobis distance that an ellipsoid counts for which has no box, being behind or around the camera. It is
 # constant: such a state is neither attractive nor does it pull; priors hold the landmark until it is seen again.
@@ -66,9 +66,7 @@ def robust_residual(T_map_camera, quadric, K, corners, whitener, bounds, clip, k
 _UNIT = gtsam.noiseModel.Unit.Create(4)
 
 
-def box_factor(
-    pose: int, quadric: int, box: BoxMeasurement, K: Array, robust_scale: float
-) -> gtsam.CustomFactor:
+def box_factor(pose: int, quadric: int, box: BoxMeasurement, K: Array, robust_scale: float) -> gtsam.CustomFactor:
     """The factor for one box.
 
     Args:

@@ -6,8 +6,9 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from calibslam_msgs_py.measurements import Array, Boxes, Camera
 from numpy.typing import NDArray
+
+from calibslam_msgs_py.measurements import Array, Boxes, Camera
 
 # A detector's edge this close to the border is an edge of the image, not of the object [px].
 BORDER = 2.0

@@ -18,15 +18,6 @@ from collections import Counter
 from dataclasses import dataclass, field
 
 import numpy as np
-from calibslam_msgs_py.measurements import (
-    Array,
-    Boxes,
-    Camera,
-    InvalidMeasurement,
-    QuadricEstimate,
-    RelativeMotion,
-)
-from calibslam_msgs_py.settings import Settings, setting
 from scipy.spatial.transform import Rotation
 
 from calibslam_backend.association import (
@@ -42,11 +33,22 @@ from calibslam_backend.association import (
 from calibslam_backend.box_measurement import BoxMeasurement, prepare, undistorted
 from calibslam_backend.graph import GraphSettings, ObjectGraph
 from calibslam_backend.initialisation import InitialisationSettings, initialise
+from calibslam_backend.kernels import load_kernels
 from calibslam_backend.localisation import localise
 from calibslam_backend.noise import NoiseModel, NoiseSettings
+from calibslam_backend.object_map import ObjectMap
 from calibslam_backend.odometry import SECOND, MotionChain, MotionNoise
-from calibslam_backend.quadric import Ellipsoid, covariance_of_pose_and_radii
+from calibslam_backend.quadric import Ellipsoid, covariance_of_pose_and_radii, covariance_of_vector
 from calibslam_backend.tracking import Tracker, TrackingSettings, overlap, unique
+from calibslam_msgs_py.measurements import (
+    Array,
+    Boxes,
+    Camera,
+    InvalidMeasurement,
+    QuadricEstimate,
+    RelativeMotion,
+)
+from calibslam_msgs_py.settings import Settings, setting
 
 
 @dataclass(frozen=True)
@@ -111,6 +113,7 @@ class Estimator:
     LEAST_FIT = 0.1  # overlap of a box with its quadric's that is no misfit
 
     def __init__(self, camera: Camera, T_body_camera: Array, settings: EstimatorSettings) -> None:
+        load_kernels()
         self.camera = camera
         self.settings = settings
         self._T_body_camera = T_body_camera
@@ -134,6 +137,12 @@ class Estimator:
         self.associations: list[tuple[int, str]] = []  # track and true identity of each box of a keyframe
 
     # -- measurements in ----------------------------------------------------------------------------------------
+
+    def add(self, measurement: Boxes | RelativeMotion) -> list[Keyframe]:
+        """`add_boxes` or `add_motion`."""
+        if isinstance(measurement, Boxes):
+            return self.add_boxes(measurement)
+        return self.add_motion(measurement)
 
     def add_motion(self, motion: RelativeMotion) -> list[Keyframe]:
         """A motion of the body; returns the keyframes that became possible.
@@ -184,45 +193,90 @@ class Estimator:
 
     # -- estimate out -------------------------------------------------------------------------------------------
 
+    def pose(self, index: int) -> Array:
+        """(4, 4) T_map_camera of a keyframe."""
+        return self._graph.pose(index)
+
     def trajectory(self) -> Array:
         """(N, 4, 4) T_map_camera of all keyframes, at `stamps`."""
         return self._graph.poses()
+
+    def odometry(self) -> tuple[Array, Array]:
+        """The same keyframes by odometry alone: poses (N, 4, 4) and their covariances (N, 6, 6)."""
+        return self._graph.odometry()
 
     def pose_covariance(self, index: int) -> Array:
         """(6, 6) [rotation, translation] of a keyframe in its camera frame."""
         return self._graph.pose_covariance(index)
 
-    def quadrics(self, with_covariance: bool = True) -> list[QuadricEstimate]:
+    def object_map(self) -> ObjectMap:
+        """Everything that is estimated, with covariances."""
+        stamps = tuple(self.stamps)
+        covariances = [self.pose_covariance(k) for k in range(len(stamps))]
+        return ObjectMap(
+            stamps,
+            self.trajectory(),
+            np.reshape(covariances, (-1, 6, 6)),
+            tuple(self.quadrics()),
+            self.camera.frame_id,
+        )
+
+    def quadrics(self) -> list[QuadricEstimate]:
         """The map."""
         result = []
-        for j, landmark in self._graph.landmarks.items():
+        for j, covariance in self._graph.quadric_covariances().items():
             vector = self._graph.quadric(j)
             ellipsoid = Ellipsoid.from_vector(vector)
-            covariance = np.full((9, 9), np.nan)
-            if with_covariance:
-                covariance = covariance_of_pose_and_radii(vector, self._graph.quadric_covariance(j))
-            class_id = self._classes[j].most_common(1)[0][0]
             result.append(
                 QuadricEstimate(
-                    j, class_id, ellipsoid.T_world_object, ellipsoid.radii, covariance, len(landmark.boxes)
+                    j,
+                    self._classes[j].most_common(1)[0][0],
+                    ellipsoid.T_world_object,
+                    ellipsoid.radii,
+                    covariance_of_pose_and_radii(vector, covariance),
+                    len(self._graph.landmarks[j].boxes),
                 )
             )
         return result
+
+    @property
+    def objects(self) -> int:
+        """Number of quadrics."""
+        return len(self._graph.landmarks)
+
+    @property
+    def boxes_used(self) -> int:
+        """Number of boxes that quadrics rest on."""
+        return sum(len(landmark.boxes) for landmark in self._graph.landmarks.values())
 
     def quadric_of_track(self, track: int) -> int | None:
         """The quadric a track is bound to."""
         return self._candidates[track].landmark
 
-    def T_odom_now(self) -> tuple[int, Array] | None:
-        """Time [ns] and pose (4, 4) of the camera by odometry since the last keyframe; None before the first."""
-        if not self.stamps or self._motions.end is None:
-            return None
-        motion, _ = self._motions.between(self.stamps[-1], self._motions.end)
-        return self._motions.end, self._graph.pose(len(self.stamps) - 1) @ motion
+    def body_pose(self) -> Array:
+        """(4, 4) T_map_body of the newest keyframe."""
+        return self.pose(len(self.stamps) - 1) @ np.linalg.inv(self._T_body_camera)
 
-    def factors(self) -> tuple[object, object]:
-        """The factor graph and its estimate, for a batch optimiser."""
-        return self._graph.factors()
+    def load(self, known: ObjectMap) -> None:
+        """Forget everything and start in a known map, from the pose where that map was begun.
+
+        Raises:
+            ValueError: a quadric has no covariance.
+        """
+        for quadric in known.quadrics:
+            if not np.isfinite(quadric.covariance).all():
+                raise ValueError(f"quadric {quadric.id} of the map has no covariance")
+        self.reset()
+        for quadric in known.quadrics:
+            vector = Ellipsoid(quadric.T_map_object, quadric.radii).vector()
+            covariance = covariance_of_vector(quadric.T_map_object, quadric.radii, quadric.covariance)
+            self._graph.add_known_quadric(quadric.id, vector, covariance)
+            self._classes[quadric.id] = Counter({quadric.class_id: max(quadric.observations, 1)})
+            self._next_quadric = max(self._next_quadric, quadric.id + 1)
+
+    def optimise(self) -> None:
+        """Move the whole graph to its batch optimum."""
+        self._graph.optimise()
 
     # -- one image ----------------------------------------------------------------------------------------------
 
@@ -281,9 +335,7 @@ class Estimator:
             or duration >= s.keyframe_interval * SECOND
         )
 
-    def _keyframe(
-        self, boxes: Boxes, tracks: list[int], motion: Array, covariance: Array, began: float
-    ) -> Keyframe:
+    def _keyframe(self, boxes: Boxes, tracks: list[int], motion: Array, covariance: Array, began: float) -> Keyframe:
         measurements = self._measurements(boxes, tracks)
         k = len(self.stamps)
         if k:
@@ -306,7 +358,14 @@ class Estimator:
         removed = report.removed + self._merge()
         self.associations += list(zip(tracks, boxes.object_ids, strict=True))
         return Keyframe(
-            k, boxes.stamp, self._graph.pose(k), used, added, removed, report.repaired, time.perf_counter() - began
+            k,
+            boxes.stamp,
+            self._graph.pose(k),
+            used,
+            added,
+            removed,
+            report.repaired,
+            time.perf_counter() - began,
         )
 
     def _measurements(self, boxes: Boxes, tracks: list[int]) -> list[BoxMeasurement]:
@@ -339,9 +398,7 @@ class Estimator:
             prediction = predict(
                 T, self._graph.quadric(candidate.landmark), np.zeros((15, 15)), self.camera.K, box, 0.0
             )
-            fits = prediction is not None and (
-                overlap(prediction[0][None], box.corners[None])[0, 0] >= self.LEAST_FIT
-            )
+            fits = prediction is not None and (overlap(prediction[0][None], box.corners[None])[0, 0] >= self.LEAST_FIT)
             seen = any(n == k for n, _ in self._graph.landmarks[candidate.landmark].boxes[-2:])
             if fits and not seen:
                 self._graph.add_box(k, candidate.landmark, box)
@@ -366,20 +423,18 @@ class Estimator:
         if not rows:
             return
         T = self._graph.pose(k)
+        near = [
+            j
+            for j, landmark in self._graph.landmarks.items()
+            if j not in taken and landmark.factors and self._near(T, j, [measurements[i] for i in rows])
+        ]
         predictions = []
-        for j in self._graph.landmarks:
-            if j in taken or not len(self._graph.landmarks[j].factors):
-                continue
-            quadric = self._graph.quadric(j)
-            box = measurements[rows[0]]
-            plain = predict(T, quadric, np.zeros((15, 15)), self.camera.K, box, 0.0)
-            if plain is None or not _near_image(plain[0], box.bounds):
-                continue
-            covariance = self._graph.joint_covariance(k - 1, j)
+        for j, covariance in zip(near, self._graph.joint_covariances(k - 1, near), strict=True):
             covariance[:6, :6] += step
-            full = predict(T, quadric, covariance, self.camera.K, box, self.settings.model_error)
-            assert full is not None
-            predictions.append(Prediction(j, *full, self._classes[j].most_common(1)[0][0]))
+            box = measurements[rows[0]]
+            prediction = predict(T, self._graph.quadric(j), covariance, self.camera.K, box, self.settings.model_error)
+            if prediction is not None:
+                predictions.append(Prediction(j, *prediction, self._classes[j].most_common(1)[0][0]))
         classes = [self._candidates[tracks[i]].classes.most_common(1)[0][0] for i in rows]
         cost = distances(predictions, [measurements[i] for i in rows], classes, self.settings)
         for p, r in assign(cost):
@@ -387,6 +442,16 @@ class Estimator:
             landmark = self._votes.add(track, predictions[p].landmark)
             if landmark is not None and not self._seen_apart(self._candidates[track], landmark):
                 self._bind(track, landmark)
+
+    def _near(self, T_map_camera: Array, j: int, boxes: list[BoxMeasurement]) -> bool:
+        """Whether the box a quadric predicts comes within its own size of one of these boxes."""
+        prediction = predict(T_map_camera, self._graph.quadric(j), np.zeros((15, 15)), self.camera.K, boxes[0], 0.0)
+        if prediction is None:
+            return False
+        corners = prediction[0]
+        size = np.tile(corners[2:] - corners[:2], 2)
+        grown = corners + np.array([-1.0, -1.0, 1.0, 1.0]) * size
+        return bool(overlap(grown[None], np.stack([box.corners for box in boxes])).max() > 0.0)
 
     def _bind(self, track: int, landmark: int) -> None:
         """The track's boxes are of this quadric: those it has and those to come."""
@@ -415,7 +480,7 @@ class Estimator:
                 continue
             j = self._next_quadric
             self._next_quadric += 1
-            self._graph.add_quadric(j, first, [])
+            self._graph.add_quadric(j, first.vector)
             self._bind(track, j)
             added.append(j)
         return added
@@ -498,12 +563,6 @@ def select(boxes: Boxes, indices: Array) -> Boxes:
         tuple(boxes.object_ids[i] for i in indices),
         boxes.frame_id,
     )
-
-
-def _near_image(corners: Array, bounds: Array) -> bool:
-    """Whether a box comes within half an image of the image."""
-    margin = 0.5 * (bounds[2:] - bounds[:2])
-    return bool((corners[2:] > bounds[:2] - margin).all() and (corners[:2] < bounds[2:] + margin).all())
 
 
 def _apart(a: list[tuple[int, BoxMeasurement]], b: list[tuple[int, BoxMeasurement]]) -> bool:

@@ -14,23 +14,28 @@ from dataclasses import dataclass, field
 
 import gtsam
 import numpy as np
-from calibslam_msgs_py.measurements import Array
-from calibslam_msgs_py.settings import Settings, setting
 from gtsam import symbol
 
 from calibslam_backend.box_factor import box_factor
 from calibslam_backend.box_measurement import BoxMeasurement
-from calibslam_backend.initialisation import Initialised, InitialisationSettings
+from calibslam_backend.initialisation import InitialisationSettings
 from calibslam_backend.quadric import Ellipsoid
+from calibslam_msgs_py.measurements import Array
+from calibslam_msgs_py.settings import Settings, setting
 
 log = logging.getLogger(__name__)
 
 
+# The first keyframe is the origin of the map, whose axes are those of REP 103: x forward, y left, z up, while a
+# camera's are z forward, x right, y down.
+T_MAP_FIRST_CAMERA = np.array(
+    [[0.0, 0.0, 1.0, 0.0], [-1.0, 0.0, 0.0, 0.0], [0.0, -1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]]
+)
+
+
 @dataclass(frozen=True)
 class GraphSettings(Settings):
-    robust_scale: float = setting(
-        2.0, "Mahalanobis distance from which a box counts as doubtful", low=0.1, high=1e6
-    )
+    robust_scale: float = setting(2.0, "Mahalanobis distance from which a box counts as doubtful", low=0.1, high=1e6)
     robust_odometry: float = setting(
         3.0, "Mahalanobis distance from which a motion counts as doubtful", low=0.1, high=1e6
     )
@@ -43,9 +48,10 @@ class GraphSettings(Settings):
 
 @dataclass
 class Landmark:
-    """What the graph knows of a quadric: its first guess, its boxes by keyframe, its factors."""
+    """What the graph knows of a quadric: its prior (vector and covariance), its boxes by keyframe, its factors."""
 
-    first: Initialised
+    prior: Array
+    covariance: Array
     born: int
     boxes: list[tuple[int, BoxMeasurement]] = field(default_factory=list)
     factors: list[int] = field(default_factory=list)
@@ -71,7 +77,7 @@ class ObjectGraph:
         self._sigmas = priors.prior_sigmas()
         self._motions: list[tuple[Array, Array]] = []  # between consecutive poses, with covariance
         self.landmarks: dict[int, Landmark] = {}
-        self._origin = gtsam.Pose3()
+        self._origin = gtsam.Pose3(T_MAP_FIRST_CAMERA)
         self._isam = self._new_isam()
         self._begin_change()
         self._values = gtsam.Values()
@@ -92,6 +98,16 @@ class ObjectGraph:
         """(N, 4, 4) of all keyframes."""
         return np.stack([self.pose(k) for k in range(self.size)]) if self.size else np.empty((0, 4, 4))
 
+    def odometry(self) -> tuple[Array, Array]:
+        """What odometry alone says: poses (N, 4, 4) and their covariances (N, 6, 6), from the same origin."""
+        poses = [self._origin]
+        covariances = [np.eye(6) * self._settings.prior_sigma**2]
+        for motion, covariance in self._motions:
+            back = gtsam.Pose3(motion).inverse().AdjointMap()
+            poses.append(poses[-1] * gtsam.Pose3(motion))
+            covariances.append(back @ covariances[-1] @ back.T + covariance)
+        return np.stack([pose.matrix() for pose in poses]), np.stack(covariances)
+
     def quadric(self, j: int) -> Array:
         """(9,) centre and logarithmic shape."""
         return np.asarray(self._values.atVector(symbol("q", j)))
@@ -100,15 +116,22 @@ class ObjectGraph:
         """(6, 6) [rotation, translation] of keyframe k in its body."""
         return np.asarray(self._isam.marginalCovariance(symbol("x", k)))
 
-    def quadric_covariance(self, j: int) -> Array:
-        """(9, 9) of the vector of quadric j."""
-        return np.asarray(self._isam.marginalCovariance(symbol("q", j)))
+    def quadric_covariances(self) -> dict[int, Array]:
+        """For each quadric (9, 9) of its vector."""
+        keys = {j: symbol("q", j) for j in self.landmarks}
+        if not keys:
+            return {}
+        # One call for all: each costs a solve over the tree between its variables.
+        joint = self._isam.jointMarginalCovariance(list(keys.values()))
+        return {j: np.asarray(joint.at(key, key)) for j, key in keys.items()}
 
-    def joint_covariance(self, k: int, j: int) -> Array:
-        """(15, 15) of pose k and quadric j: columns of `quadric.box_of_visible_part`."""
-        keys = [symbol("x", k), symbol("q", j)]
+    def joint_covariances(self, k: int, quadrics: list[int]) -> list[Array]:
+        """For each of these quadrics (15, 15) of pose k and the quadric: columns of `quadric.box_of_visible_part`."""
+        if not quadrics:
+            return []
+        keys = [symbol("x", k), *(symbol("q", j) for j in quadrics)]
         joint = self._isam.jointMarginalCovariance(keys)
-        return np.block([[joint.at(a, b) for b in keys] for a in keys])
+        return [np.block([[joint.at(a, b) for b in (keys[0], q)] for a in (keys[0], q)]) for q in keys[1:]]
 
     # -- changes, which take effect with the next update --------------------------------------------------------
 
@@ -129,14 +152,16 @@ class ObjectGraph:
             values.insert(symbol("x", k), gtsam.Pose3(guess))
         return k
 
-    def add_quadric(self, j: int, first: Initialised, boxes: list[tuple[int, BoxMeasurement]]) -> None:
-        """A new quadric with the boxes (keyframe, box) seen of it so far."""
-        self.landmarks[j] = Landmark(first, self.size)
+    def add_quadric(self, j: int, vector: Array) -> None:
+        """A new quadric, first seen as this vector (9,)."""
+        self.add_known_quadric(j, vector, np.diag(self._sigmas**2))
+
+    def add_known_quadric(self, j: int, vector: Array, covariance: Array) -> None:
+        """A quadric that is known as well as this covariance (9, 9) says."""
+        self.landmarks[j] = Landmark(vector, covariance, self.size)
         for values in (self._new_values, self._values):
-            values.insert(symbol("q", j), first.vector)
-        self._add_prior_factors(j)
-        for k, box in boxes:
-            self.add_box(k, j, box)
+            values.insert(symbol("q", j), vector)
+        self._add_prior_factor(j)
 
     def add_box(self, k: int, j: int, box: BoxMeasurement) -> None:
         """A box of quadric j in keyframe k."""
@@ -146,7 +171,7 @@ class ObjectGraph:
     def remove_quadric(self, j: int) -> None:
         """Take a quadric out, with all that was measured of it."""
         landmark = self.landmarks.pop(j)
-        if symbol("q", j) in self._new_values.keys():
+        if self._new_values.exists(symbol("q", j)):
             raise ValueError(f"quadric {j} was added in the same update")
         self._to_remove += landmark.factors
         self._values.erase(symbol("q", j))
@@ -172,14 +197,17 @@ class ObjectGraph:
                 repaired = self._repair(error)
         return UpdateReport(removed, repaired)
 
-    def factors(self) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
-        """The whole graph and the current estimate, for a batch optimiser."""
+    def optimise(self) -> None:
+        """The batch optimum by Levenberg-Marquardt, from which the tree is built anew."""
         graph = gtsam.NonlinearFactorGraph()
         held = self._isam.getFactorsUnsafe()
         for i in range(held.size()):
             if held.exists(i):
                 graph.push_back(held.at(i))
-        return graph, gtsam.Values(self._values)
+        parameters = gtsam.LevenbergMarquardtParams()
+        parameters.setMaxIterations(100)
+        self._values = gtsam.LevenbergMarquardtOptimizer(graph, self._values, parameters).optimize()
+        self._rebuild()
 
     def _step(self, everything: bool) -> None:
         changes = gtsam.ISAM2UpdateParams()
@@ -219,7 +247,7 @@ class ObjectGraph:
             return False
         radii = Ellipsoid.from_vector(vector).radii
         return bool(
-            self.SMALLEST_RADIUS < radii.min()
+            radii.min() > self.SMALLEST_RADIUS
             and radii.max() < self.LARGEST_RADIUS
             and np.linalg.norm(vector[:3] - self.pose(self.size - 1)[:3, 3]) < self.LARGEST_DISTANCE
         )
@@ -237,11 +265,19 @@ class ObjectGraph:
         log.warning("%s; rebuilding without quadrics %s", reason, sorted(suspects) or "removed")
         for j in suspects & set(self.landmarks):
             del self.landmarks[j]
+        try:
+            self._rebuild()
+        except RuntimeError as again:
+            if not self.landmarks:
+                raise
+            return f"{reason}; {self._repair(again)}"
+        return reason
+
+    def _rebuild(self) -> None:
+        """A new tree of all factors, linearised at the current estimate."""
         self._isam = self._new_isam()
         estimate = self._values
         self._begin_change()
-        if not self._has_origin:
-            raise error
         self._add_origin_factor(insert=False)
         for k in range(1, self.size):
             self._add_motion_factor(k)
@@ -250,16 +286,10 @@ class ObjectGraph:
         for j, landmark in self.landmarks.items():
             landmark.factors = []
             self._new_values.insert(symbol("q", j), estimate.atVector(symbol("q", j)))
-            self._add_prior_factors(j)
+            self._add_prior_factor(j)
             for k, box in landmark.boxes:
                 self._add_box_factor(k, j, box)
-        try:
-            self._step(True)
-        except RuntimeError as again:
-            if not self.landmarks:
-                raise
-            return f"{reason}; {self._repair(again)}"
-        return reason
+        self._step(True)
 
     def _new_isam(self) -> gtsam.ISAM2:
         parameters = gtsam.ISAM2Params()
@@ -300,9 +330,10 @@ class ObjectGraph:
         )
         self._add(gtsam.BetweenFactorPose3(symbol("x", k - 1), symbol("x", k), gtsam.Pose3(motion), noise))
 
-    def _add_prior_factors(self, j: int) -> None:
-        noise = gtsam.noiseModel.Diagonal.Sigmas(self._sigmas)
-        self._add(gtsam.PriorFactorVector(symbol("q", j), self.landmarks[j].first.vector, noise), j)
+    def _add_prior_factor(self, j: int) -> None:
+        landmark = self.landmarks[j]
+        noise = gtsam.noiseModel.Gaussian.Covariance(landmark.covariance)
+        self._add(gtsam.PriorFactorVector(symbol("q", j), landmark.prior, noise), j)
 
     def _add_box_factor(self, k: int, j: int, box: BoxMeasurement) -> None:
         self._add(box_factor(symbol("x", k), symbol("q", j), box, self._K, self._settings.robust_scale), j)

@@ -12,12 +12,13 @@ from dataclasses import dataclass
 
 import numba
 import numpy as np
-from calibslam_msgs_py.measurements import Array
-from calibslam_msgs_py.settings import Settings, setting
+from numpy.typing import NDArray
 
 from calibslam_backend.box_factor import INVISIBLE, robust_loss, whitened_residual
 from calibslam_backend.box_measurement import BoxMeasurement
 from calibslam_backend.quadric import Ellipsoid
+from calibslam_msgs_py.measurements import Array
+from calibslam_msgs_py.settings import Settings, setting
 
 
 @dataclass(frozen=True)
@@ -75,7 +76,15 @@ def initialise(
     if guess is None:
         return None
     vector, information, distances = _refine(
-        np.ascontiguousarray(poses), guess, K, corners, whiteners, bounds, clip, robust_scale, settings.prior_sigmas()
+        np.ascontiguousarray(poses),
+        guess,
+        K,
+        corners,
+        whiteners,
+        bounds,
+        clip,
+        robust_scale,
+        settings.prior_sigmas(),
     )
     covariance = np.linalg.inv(information)
     depth = np.median(np.linalg.norm(poses[:, :3, 3] - vector[:3], axis=1))
@@ -91,7 +100,7 @@ def initialise(
     return Initialised(vector, covariance, distances)
 
 
-def _first_guess(poses: Array, corners: Array, clip: Array, K: Array) -> Array | None:
+def _first_guess(poses: Array, corners: Array, clip: NDArray[np.bool_], K: Array) -> Array | None:
     """Vector (9,) of an ellipsoid with the axes of the middle view; None if it is behind a camera."""
     whole = ~clip.any(axis=1)
     use = whole if np.count_nonzero(whole) >= 3 else np.ones(len(poses), bool)
@@ -118,9 +127,7 @@ def _normal_equations(poses, vector, K, corners, whiteners, bounds, clip, k, A, 
     """Adds the boxes to A (9, 9) and b (9,), writes the distances (N,); returns the cost."""
     cost = 0.0
     for n in range(len(poses)):
-        visible, r, dr = whitened_residual(
-            poses[n], vector, K, corners[n], whiteners[n], bounds[n], clip[n]
-        )
+        visible, r, dr = whitened_residual(poses[n], vector, K, corners[n], whiteners[n], bounds[n], clip[n])
         q = r @ r if visible else INVISIBLE**2
         rho, weight = robust_loss(q, k)
         cost += rho
@@ -156,5 +163,5 @@ def _refine(poses, guess, K, corners, whiteners, bounds, clip, k, sigmas):  # ty
             damping *= 10.0
             if damping > 1e8:
                 break
-        step = np.linalg.solve(A_best + damping * np.diag(np.diag(A_best)), b_best)
+        step[:] = np.linalg.solve(A_best + damping * np.diag(np.diag(A_best)), b_best)
     return best, A_best, distances

@@ -10,10 +10,10 @@ from __future__ import annotations
 import gtsam
 import numba
 import numpy as np
-from calibslam_msgs_py.measurements import Array
 
 from calibslam_backend.box_factor import INVISIBLE, robust_loss, whitened_residual
 from calibslam_backend.box_measurement import BoxMeasurement
+from calibslam_msgs_py.measurements import Array
 
 # The second start believes odometry this much less: its standard deviations times ten.
 DISTRUST = 10.0

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import gtsam
 import numpy as np
+
 from calibslam_msgs_py.measurements import Array, InvalidMeasurement, RelativeMotion
 from calibslam_msgs_py.settings import Settings, setting
 
@@ -45,8 +46,7 @@ class OdometryDifferencer:
         self,
         stamp: int,
         T_odom_body: Array,
-        twist: Array | None = None,
-        twist_covariance: Array | None = None,
+        velocity_covariance: Array | None = None,
         frame_id: str = "camera",
     ) -> RelativeMotion | None:
         """The motion since the last pose; None for the first.
@@ -54,26 +54,16 @@ class OdometryDifferencer:
         Args:
             stamp: time [ns].
             T_odom_body: (4, 4).
-            twist: (6,) linear [m/s] and angular [rad/s] velocity in the body; not needed, checked if given.
-            twist_covariance: (6, 6) of the twist over the step that ends here, in ROS order (linear, angular):
-                the motion has this covariance times the step's duration squared. None or zeros: unknown.
+            velocity_covariance: (6, 6) [rotation rad/s, translation m/s] in the body, over the step that ends here:
+                the motion has this covariance times the step's duration squared. None: unknown.
             frame_id: name of the body.
 
         Raises:
-            InvalidMeasurement: "not_finite", "not_a_rotation", "covariance" or "time_backwards". After a jump of
-                time backwards the next motion starts at the new time.
+            InvalidMeasurement: "duplicate" or "time_backwards". After a jump of time backwards the next motion
+                starts at the new time.
         """
-        R = T_odom_body[:3, :3]
-        if not np.isfinite(T_odom_body).all() or (twist is not None and not np.isfinite(twist).all()):
-            raise InvalidMeasurement("not_finite", f"odometry at {stamp} ns is not finite")
-        if not np.allclose(R @ R.T, np.eye(3), atol=1e-3):
-            raise InvalidMeasurement("not_a_rotation", f"odometry at {stamp} ns has an invalid orientation")
-        covariance = None
-        if twist_covariance is not None and np.any(twist_covariance):
-            order = [3, 4, 5, 0, 1, 2]
-            covariance = np.asarray(twist_covariance, float)[np.ix_(order, order)]
-            if not np.isfinite(covariance).all() or np.linalg.eigvalsh(covariance)[0] <= 0.0:
-                raise InvalidMeasurement("covariance", f"twist covariance at {stamp} ns is not positive definite")
+        if stamp == self._stamp:
+            raise InvalidMeasurement("duplicate", f"odometry at {stamp} ns came twice")
         last_stamp, last_T = self._stamp, self._T
         if last_stamp is not None and stamp == last_stamp:
             raise InvalidMeasurement("duplicate", f"odometry at {stamp} ns came twice")
@@ -82,6 +72,7 @@ class OdometryDifferencer:
             return None
         if stamp < last_stamp:
             raise InvalidMeasurement("time_backwards", f"odometry jumped from {last_stamp} back to {stamp} ns")
+        covariance = velocity_covariance
         if covariance is not None:
             covariance = covariance * ((stamp - last_stamp) / SECOND) ** 2
         return RelativeMotion(last_stamp, stamp, np.linalg.inv(last_T) @ T_odom_body, covariance, frame_id)
@@ -134,7 +125,8 @@ class MotionChain:
         last = self._times[-1]
         if motion.start < last:
             raise InvalidMeasurement(
-                "overlap", f"motion from {motion.start} to {motion.end} ns starts before {last} ns, the last one's end"
+                "overlap",
+                f"motion from {motion.start} to {motion.end} ns starts before {last} ns, the last one's end",
             )
         contiguous = motion.start == last
         if not contiguous:

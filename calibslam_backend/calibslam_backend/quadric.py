@@ -22,6 +22,7 @@ from dataclasses import dataclass
 
 import numba
 import numpy as np
+
 from calibslam_msgs_py.measurements import Array
 
 # Columns of a Jacobian: camera rotation and translation (right perturbation, GTSAM's Pose3), then the vector (t, L).
@@ -313,3 +314,19 @@ def covariance_of_pose_and_radii(vector: Array, covariance: Array) -> Array:
     shrink = np.sqrt(uniform / (uniform + np.diag(result)[:3]))
     scale = np.concatenate([shrink, np.ones(6)])
     return np.asarray(result * np.outer(scale, scale))
+
+
+def covariance_of_vector(T_map_object: Array, radii: Array, covariance: Array) -> Array:
+    """The inverse of `covariance_of_pose_and_radii`: covariance (9, 9) of (t, L), positive definite."""
+    R, l = T_map_object[:3, :3], np.log(radii)  # noqa: E741
+    J = np.zeros((9, 9))
+    J[:3, 3:6] = R
+    for n, (i, j, k) in enumerate(((1, 2, 0), (2, 0, 1), (0, 1, 2))):
+        turned = np.zeros((3, 3))
+        turned[i, j] = turned[j, i] = l[i] - l[j]
+        grown = np.zeros((3, 3))
+        grown[k, k] = 1.0 / radii[k]
+        J[3:, n] = vector_from_matrix(R @ turned @ R.T)
+        J[3:, 6 + k] = vector_from_matrix(R @ grown @ R.T)
+    # Where radii are equal, no rotation changes L: give those directions a little freedom.
+    return np.asarray(J @ covariance @ J.T + 1e-9 * np.eye(9))

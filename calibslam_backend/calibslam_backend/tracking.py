@@ -10,16 +10,16 @@ from collections import Counter
 from dataclasses import dataclass, field
 
 import numpy as np
-from calibslam_msgs_py.measurements import Array
-from calibslam_msgs_py.settings import Settings, setting
 from scipy.optimize import linear_sum_assignment
 
 from calibslam_backend.odometry import SECOND
+from calibslam_msgs_py.measurements import Array
+from calibslam_msgs_py.settings import Settings, setting
 
 
 @dataclass(frozen=True)
 class TrackingSettings(Settings):
-    min_overlap: float = setting(0.3, "intersection over union of a track's last box and its next", low=0.0, high=1.0)
+    track_overlap: float = setting(0.3, "intersection over union of a track's last box and its next", low=0.0, high=1.0)
     max_gap: float = setting(0.5, "time after which an unseen track ends", unit="s", low=0.0)
     duplicate_overlap: float = setting(
         0.75, "two boxes of one image that overlap more are one object", low=0.0, high=1.0
@@ -102,7 +102,7 @@ class Tracker:
             other = np.array([[track.class_id != c for c in class_ids] for track in self.tracks])
             score = score - self.CLASS_CHANGE * other
             for t, b in zip(*linear_sum_assignment(-np.maximum(score, 0.0)), strict=True):
-                if score[t, b] > self._settings.min_overlap:
+                if score[t, b] > self._settings.track_overlap:
                     found[b] = self.tracks[t]
         linked = [track or self._begin(stamp, box) for track, box in zip(found, corners, strict=True)]
         for track, box, class_id in zip(linked, corners, class_ids, strict=True):

@@ -22,7 +22,6 @@ from calibslam_msgs_py.conversions import (
     RosTypes,
     motion_to_msg,
     odometry_from_msg,
-    ros_from_gtsam_covariance,
     stamped_pose_from_msg,
 )
 from calibslam_msgs_py.measurements import InvalidMeasurement, RelativeMotion
@@ -77,11 +76,7 @@ class OdometryNode(Node):
     def _receive_odometry(self, message: Any) -> None:
         try:
             pose, velocity_covariance = odometry_from_msg(message)
-            if velocity_covariance is not None:
-                velocity_covariance = ros_from_gtsam_covariance(velocity_covariance, np.eye(3))
-            motion = self._differencer.add(
-                pose.stamp, pose.T, twist_covariance=velocity_covariance, frame_id=message.child_frame_id
-            )
+            motion = self._differencer.add(pose.stamp, pose.T, velocity_covariance, message.child_frame_id)
         except InvalidMeasurement as error:
             self._reject(error)
             return

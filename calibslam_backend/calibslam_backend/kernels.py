@@ -1,0 +1,33 @@
+"""Compiles what numba compiles, or loads it from its cache, before the first measurement has to wait for it."""
+
+from __future__ import annotations
+
+import functools
+
+import gtsam
+import numpy as np
+
+from calibslam_backend.box_factor import box_factor
+from calibslam_backend.box_measurement import BoxMeasurement
+from calibslam_backend.initialisation import InitialisationSettings, initialise
+from calibslam_backend.localisation import localise
+from calibslam_backend.quadric import ALL_EDGES, Ellipsoid, box_of_visible_part
+
+
+@functools.cache
+def load_kernels() -> None:
+    """Call each compiled function once, with the argument types it will have; 0.7 s, or 30 s the first time."""
+    K = np.array([[500.0, 0.0, 320.0], [0.0, 500.0, 240.0], [0.0, 0.0, 1.0]])
+    bounds = np.array([0.0, 0.0, 640.0, 480.0])
+    vector = Ellipsoid(gtsam.Pose3(gtsam.Rot3(), np.array([0.0, 0.0, 2.0])).matrix(), np.full(3, 0.2)).vector()
+    poses = [gtsam.Pose3(gtsam.Rot3(), np.array([0.1 * k, 0.0, 0.0])) for k in range(4)]
+    boxes = []
+    for pose in poses:
+        _, corners, _ = box_of_visible_part(pose.matrix(), vector, K, bounds, ALL_EDGES)
+        boxes.append(BoxMeasurement(corners, np.eye(4), bounds, ~ALL_EDGES))
+    values = gtsam.Values()
+    values.insert(0, poses[0])
+    values.insert(1, vector)
+    box_factor(0, 1, boxes[0], K, 1.0).linearize(values)
+    initialise(np.stack([pose.matrix() for pose in poses]), boxes, K, 1.0, InitialisationSettings())
+    localise(poses[0].matrix(), np.eye(6), [values.atVector(1)], boxes[:1], K, 1.0, 1.0)

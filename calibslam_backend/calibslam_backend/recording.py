@@ -1,0 +1,143 @@
+"""A bag as the measurements the estimator takes, in the order of their log times: what the nodes see, without ROS."""
+
+from __future__ import annotations
+
+import logging
+from collections import Counter
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from importlib.metadata import entry_points
+from pathlib import Path
+
+import numpy as np
+
+from calibslam_backend.metrics import Trajectory
+from calibslam_backend.odometry import OdometryDifferencer
+from calibslam_msgs_py.bags import BagError, BagReader
+from calibslam_msgs_py.conversions import (
+    boxes_from_msg,
+    camera_from_msg,
+    motion_from_msg,
+    odometry_from_msg,
+    stamped_pose_from_msg,
+    valid_boxes,
+)
+from calibslam_msgs_py.measurements import Boxes, Camera, InvalidMeasurement, RelativeMotion
+
+log = logging.getLogger(__name__)
+
+BOXES, RAW_BOXES, CAMERA = "/detections", "/detections_raw", "/camera/camera_info"
+MOTIONS, ODOMETRY, GROUND_TRUTH = "/relative_pose", "/odom", "/ground_truth"
+
+Calibrator = Callable[[Boxes], Boxes]
+
+
+def load_calibrator(path: str | None) -> Calibrator:
+    """The installed calibrator of boxes without covariance, with the model of a file or its default one.
+
+    Raises:
+        BagError: no package offers one.
+    """
+    found = list(entry_points(group="calibslam.calibrators", name="default"))
+    if not found:
+        raise BagError("no calibrator is installed: build calibslam_detector, or choose --noise-model fixed")
+    calibrator: Calibrator = found[0].load()(path)
+    return calibrator
+
+
+@dataclass
+class Recording:
+    """The measurements of a bag.
+
+    Attributes:
+        path: of the bag.
+        camera: from its camera_info.
+        rejected: why and how many messages or boxes were left out.
+    """
+
+    path: Path
+    camera: Camera
+    rejected: Counter[str]
+    _topics: dict[str, str]
+    _calibrator: Calibrator | None
+
+    @classmethod
+    def open(cls, path: str | Path, calibrator: str | None = None) -> Recording:
+        """A bag with boxes, a camera and odometry.
+
+        Args:
+            path: rosbag2 folder or .mcap file.
+            calibrator: file with the model for boxes without covariance; None: the default one.
+
+        Raises:
+            BagError: it cannot be read, or misses a topic; the text says which and what is there.
+        """
+        with BagReader(path) as bag:
+            boxes = BOXES if BOXES in bag.topics else RAW_BOXES
+            motions = MOTIONS if MOTIONS in bag.topics else ODOMETRY
+            missing = [
+                " or ".join(names)
+                for names in ((BOXES, RAW_BOXES), (MOTIONS, ODOMETRY), (CAMERA,))
+                if not any(name in bag.topics for name in names)
+            ]
+            if missing:
+                there = ", ".join(f"{name} ({bag.counts[name]})" for name in bag.topics) or "nothing"
+                raise BagError(f"{path} has no topic {' and no topic '.join(missing)}; it has: {there}")
+            camera = cls._camera(bag)
+        model = load_calibrator(calibrator) if boxes == RAW_BOXES or calibrator else None
+        return cls(Path(path), camera, Counter(), {"boxes": boxes, "motions": motions}, model)
+
+    @staticmethod
+    def _camera(bag: BagReader) -> Camera:
+        for _, _, message in bag.messages([CAMERA]):
+            try:
+                return camera_from_msg(message)
+            except InvalidMeasurement as error:
+                raise BagError(f"{bag.path}: {CAMERA}: {error}") from error
+        raise BagError(f"{bag.path} has no message on {CAMERA}")
+
+    def measurements(self) -> Iterator[Boxes | RelativeMotion]:
+        """Boxes and motions in the order of their log times; what is invalid is counted in `rejected`."""
+        boxes, motions = self._topics["boxes"], self._topics["motions"]
+        differencer = OdometryDifferencer()
+        with BagReader(self.path) as bag:
+            for topic, _, message in bag.messages([boxes, motions]):
+                try:
+                    if topic == boxes:
+                        measured, dropped = valid_boxes(boxes_from_msg(message))
+                        self.rejected.update({f"box_{reason}": n for reason, n in dropped.items()})
+                        yield self._calibrator(measured) if self._calibrator else measured
+                    elif topic == MOTIONS:
+                        yield motion_from_msg(message)
+                    else:
+                        pose, covariance = odometry_from_msg(message)
+                        motion = differencer.add(pose.stamp, pose.T, covariance, message.child_frame_id)
+                        if motion is not None:
+                            yield motion
+                except InvalidMeasurement as error:
+                    self.reject(error)
+            self.rejected.update({f"undecodable{topic}": n for topic, n in bag.rejected.items()})
+
+    def reject(self, error: InvalidMeasurement) -> None:
+        """Count a measurement that cannot be used, and say the first of each kind."""
+        if not self.rejected[error.reason]:
+            log.warning("rejected (%s, further ones are only counted): %s", error.reason, error)
+        self.rejected[error.reason] += 1
+
+    def ground_truth(self) -> Trajectory | None:
+        """The true trajectory, if the bag has one."""
+        with BagReader(self.path) as bag:
+            if GROUND_TRUTH not in bag.topics:
+                return None
+            poses = {}
+            for _, _, message in bag.messages([GROUND_TRUTH]):
+                try:
+                    pose = stamped_pose_from_msg(message)
+                except InvalidMeasurement as error:
+                    self.reject(error)
+                    continue
+                poses[pose.stamp] = pose.T
+        if len(poses) < 2:
+            return None
+        stamps = sorted(poses)
+        return Trajectory(np.array(stamps), np.stack([poses[stamp] for stamp in stamps]))

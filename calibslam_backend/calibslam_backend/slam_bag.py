@@ -1,0 +1,172 @@
+"""`slam_bag BAG --out RUN`: the back end on a bag, without ROS; the same bag gives the same result, byte for byte."""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import logging
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from calibslam_backend.estimator import Estimator, EstimatorSettings, Keyframe
+from calibslam_backend.odometry import SECOND
+from calibslam_backend.published import POSE, map_messages, pose_message
+from calibslam_backend.recording import Recording
+from calibslam_backend.run_folder import RunRecord, write_run
+from calibslam_backend.transform import transform_from_text
+from calibslam_msgs_py import bags
+from calibslam_msgs_py.bags import BagError, BagReader, BagWriter
+from calibslam_msgs_py.measurements import Boxes, InvalidMeasurement
+from calibslam_msgs_py.settings import SettingsError, add_arguments, from_arguments
+
+MAP_PERIOD = 1.0  # [s] of recorded time between two maps in run.mcap
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Entry of the executable; returns the exit code."""
+    parser = argparse.ArgumentParser(prog="slam_bag", description=__doc__)
+    parser.add_argument("bag", help="rosbag2 folder or .mcap file with boxes, odometry and camera_info")
+    parser.add_argument("--out", required=True, type=Path, metavar="RUN", help="folder for the result")
+    parser.add_argument("--calibrator", metavar="FILE", help="model for boxes without covariance")
+    parser.add_argument("--batch", action="store_true", help="optimise the whole graph once more at the end")
+    parser.add_argument(
+        "--camera-in-body",
+        default="0 0 0 0 0 0 1",
+        metavar='"X Y Z QX QY QZ QW"',
+        help="pose of the camera's optical frame in the body that odometry moves (default: %(default)s)",
+    )
+    add_arguments(parser, EstimatorSettings)
+    parsed = parser.parse_args(arguments)
+    logging.basicConfig(level=logging.WARNING, format="%(levelname)s: %(message)s")
+    try:
+        settings = from_arguments(parsed, EstimatorSettings)
+        metrics = slam_bag(parsed.bag, parsed.out, settings, parsed.calibrator, parsed.batch, parsed.camera_in_body)
+    except (BagError, SettingsError, ValueError, OSError) as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 1
+    if not metrics["keyframes"]:
+        print(
+            f"error: {parsed.bag}: no image lies within the time of the odometry: do their clocks agree?",
+            file=sys.stderr,
+        )
+        return 1
+    _summary(parsed.out, metrics)
+    return 0
+
+
+def slam_bag(
+    bag: str | Path,
+    out: Path,
+    settings: EstimatorSettings,
+    calibrator: str | None = None,
+    batch: bool = False,
+    camera_in_body: str = "0 0 0 0 0 0 1",
+) -> dict[str, object]:
+    """Run the estimator over a bag and write a RUN folder; returns its metrics."""
+    recording = Recording.open(bag, calibrator)
+    estimator = Estimator(recording.camera, transform_from_text(camera_in_body), settings)
+    out.mkdir(parents=True, exist_ok=True)
+    began = time.perf_counter()
+    keyframes: list[Keyframe] = []
+    first, last = 0, 0
+    progress = _Progress(Path(bag))
+    with BagWriter(out / "run.mcap", overwrite=True) as writer:
+        next_map = 0
+        for measurement in recording.measurements():
+            stamp = measurement.stamp if isinstance(measurement, Boxes) else measurement.end
+            first, last = first or stamp, max(last, stamp)
+            try:
+                new = estimator.add(measurement)
+            except InvalidMeasurement as error:
+                recording.reject(error)
+                continue
+            for keyframe in new:
+                keyframes.append(keyframe)
+                writer.write(f"/{POSE}", pose_message(estimator, bags.types), keyframe.stamp)
+                if keyframe.stamp >= next_map:
+                    next_map = keyframe.stamp + int(MAP_PERIOD * SECOND)
+                    for topic, message in map_messages(estimator, bags.types):
+                        writer.write(f"/{topic}", message, keyframe.stamp)
+            progress.show((last - first) / SECOND, len(keyframes), estimator.objects)
+        estimator.finish()
+        if batch:
+            estimator.optimise()
+        if estimator.stamps:
+            for topic, message in map_messages(estimator, bags.types):
+                writer.write(f"/{topic}", message, estimator.stamps[-1])
+    progress.end()
+    recording.rejected["without_odometry"] += estimator.waiting
+    record = run_record(
+        estimator, keyframes, dict(+recording.rejected), time.perf_counter() - began, (last - first) / SECOND
+    )
+    return write_run(out, Path(bag).name, estimator.object_map(), record, recording.ground_truth())
+
+
+def run_record(
+    estimator: Estimator,
+    keyframes: Sequence[Keyframe],
+    rejected: dict[str, int],
+    wall_s: float,
+    sequence_s: float,
+) -> RunRecord:
+    """What the run folder wants to know beside the map."""
+    counts = {**estimator.counts}
+    rejections = {
+        **rejected,
+        **{k.removeprefix("rejected_"): n for k, n in counts.items() if k.startswith("rejected_")},
+    }
+    return RunRecord(
+        odometry=estimator.odometry(),
+        online=np.reshape([keyframe.T_map_camera for keyframe in keyframes], (-1, 4, 4)),
+        seconds=np.array([keyframe.seconds for keyframe in keyframes]),
+        boxes_used=estimator.boxes_used,
+        boxes_rejected=sum(rejections.values()),
+        rejected={**rejections, **{k: n for k, n in counts.items() if not k.startswith("rejected_")}},
+        associations=[(estimator.quadric_of_track(track), name) for track, name in estimator.associations],
+        wall_s=wall_s,
+        sequence_s=sequence_s,
+        settings=dataclasses.asdict(estimator.settings),
+    )
+
+
+class _Progress:
+    """One line on a terminal, nothing elsewhere."""
+
+    def __init__(self, bag: Path) -> None:
+        self._bag, self._shown = bag, 0.0
+        with BagReader(bag) as reader:
+            self._length = (reader.end - reader.start) / SECOND
+
+    def show(self, seconds: float, keyframes: int, quadrics: int) -> None:
+        if sys.stderr.isatty() and time.monotonic() - self._shown > 0.2:
+            self._shown = time.monotonic()
+            share = min(seconds / self._length, 1.0) if self._length else 1.0
+            print(
+                f"\r{self._bag.name}: {share:4.0%}  {keyframes} keyframes, {quadrics} objects ",
+                end="",
+                file=sys.stderr,
+            )
+
+    def end(self) -> None:
+        if self._shown:
+            print("\r\033[K", end="", file=sys.stderr)
+
+
+def _summary(out: Path, metrics: dict[str, object]) -> None:
+    def metre(value: object) -> str:
+        return f"{value:.3f} m" if isinstance(value, float) else "no ground truth"
+
+    print(
+        f"{metrics['keyframes']} keyframes, {metrics['objects']} objects, "
+        f"{metrics['boxes_used']} boxes used, {metrics['boxes_rejected']} rejected\n"
+        f"ATE {metre(metrics['ate_m'])} (odometry alone: {metre(metrics['odometry_ate_m'])})\n"
+        f"result: {out}"
+    )
+
+
+if __name__ == "__main__":
+    sys.exit(main())
