@@ -25,6 +25,8 @@ setup(
             f"evaluate = {PACKAGE}.evaluate:main",
             f"odometry = {PACKAGE}.odometry_node:main",
             f"play = {PACKAGE}.play_node:main",
+            f"record = {PACKAGE}.record_node:main",
+            f"save_map = {PACKAGE}.save_map_node:main",
             f"simulate = {PACKAGE}.simulate:main",
             f"tum_to_bag = {PACKAGE}.tum_to_bag:main",
         ],

@@ -99,9 +99,7 @@ class Detector:
         return images
 
 
-def _project_all(
-    camera: Camera, world: tuple[WorldObject, ...], T_world_camera: Array
-) -> tuple[Array, Array]:
+def _project_all(camera: Camera, world: tuple[WorldObject, ...], T_world_camera: Array) -> tuple[Array, Array]:
     """Boxes (F, N, 4) [px] of whole objects and of their parts inside the image; NaN where there is none."""
     T_camera_world = np.linalg.inv(T_world_camera)
     T_world_object = np.array([o.ellipsoid.T_world_object for o in world])

@@ -41,13 +41,9 @@ def object_accuracy(estimated: Sequence[Ellipsoid], true: Sequence[Ellipsoid]) -
     """Compare a map, already aligned with the world, to the objects of the world."""
     pairs = matches(estimated, true)
     centres = [float(np.linalg.norm(_centre(estimated[i]) - _centre(true[j]))) for i, j in pairs]
-    radii = [
-        float(np.mean(np.abs(np.sort(estimated[i].radii) / np.sort(true[j].radii) - 1.0))) for i, j in pairs
-    ]
+    radii = [float(np.mean(np.abs(np.sort(estimated[i].radii) / np.sort(true[j].radii) - 1.0))) for i, j in pairs]
     overlaps = [iou(estimated[i], true[j]) for i, j in pairs]
-    return ObjectAccuracy(
-        len(true), len(estimated), len(pairs), _mean(centres), _mean(radii), _mean(overlaps)
-    )
+    return ObjectAccuracy(len(true), len(estimated), len(pairs), _mean(centres), _mean(radii), _mean(overlaps))
 
 
 def matches(estimated: Sequence[Ellipsoid], true: Sequence[Ellipsoid]) -> list[tuple[int, int]]:
@@ -59,9 +55,7 @@ def matches(estimated: Sequence[Ellipsoid], true: Sequence[Ellipsoid]) -> list[t
     distances = np.linalg.norm(a[:, None] - b[None, :], axis=2)
     # Cut off, so that one far estimate does not push others away from their objects.
     rows, columns = linear_sum_assignment(np.minimum(distances, MAX_CENTRE_DISTANCE))
-    return [
-        (int(i), int(j)) for i, j in zip(rows, columns, strict=True) if distances[i, j] < MAX_CENTRE_DISTANCE
-    ]
+    return [(int(i), int(j)) for i, j in zip(rows, columns, strict=True) if distances[i, j] < MAX_CENTRE_DISTANCE]
 
 
 def iou(a: Ellipsoid, b: Ellipsoid) -> float:

@@ -48,6 +48,4 @@ def add_noise(motion: RelativeMotion, noise: OdometryNoise, rng: np.random.Gener
     covariance = None if motion.covariance is None else motion.covariance + noise.covariance
     if covariance is not None and not covariance.any():
         covariance = None
-    return RelativeMotion(
-        motion.start, motion.end, noise.perturb(motion.T_start_end, rng), covariance, motion.frame_id
-    )
+    return RelativeMotion(motion.start, motion.end, noise.perturb(motion.T_start_end, rng), covariance, motion.frame_id)

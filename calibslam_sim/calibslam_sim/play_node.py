@@ -64,9 +64,7 @@ class Player(Node):
             self.get_logger().warning(f"{topic} is not played: there is no Python package for {kind} here")
             return
         latched = kind in LATCHED_TYPES and topic != "/tf"
-        self._publishers_by_topic[topic] = self.create_publisher(
-            message_class, topic, LATCHED if latched else PLAYED
-        )
+        self._publishers_by_topic[topic] = self.create_publisher(message_class, topic, LATCHED if latched else PLAYED)
 
     def wait_for_subscribers(self, expected: dict[str, int], timeout: float) -> None:
         """Until each topic, played here or by other nodes, has at least so many subscribers.

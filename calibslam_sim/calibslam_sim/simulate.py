@@ -48,9 +48,7 @@ def write_bag(simulation: Simulation, path: Path, overwrite: bool = False) -> No
         for thing in simulation.world
     ]
     with bags.BagWriter(path, overwrite) as bag:
-        bag.write(
-            topics.GROUND_TRUTH_QUADRICS, quadrics_to_msg(times[0], quadrics, types, topics.WORLD), times[0]
-        )
+        bag.write(topics.GROUND_TRUTH_QUADRICS, quadrics_to_msg(times[0], quadrics, types, topics.WORLD), times[0])
         for k, odometry in enumerate(topics.odometry_msgs(poses, step_covariance, types)):
             stamp = times[k]
             truth = StampedPose(stamp, simulation.T_world_camera[k])

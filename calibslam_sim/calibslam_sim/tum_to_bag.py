@@ -98,9 +98,7 @@ def items(folder: Path, camera_name: str | None, detections: Path | None) -> tup
     else:
         notes.append("no groundtruth.txt: nothing to evaluate against")
     if not image_stamps:
-        raise TumError(
-            f"{folder} holds neither odometry.txt nor detections.csv nor rgb.txt: nothing to convert"
-        )
+        raise TumError(f"{folder} holds neither odometry.txt nor detections.csv nor rgb.txt: nothing to convert")
     for stamp in image_stamps:
         add(stamp, topics.CAMERA_INFO, camera_to_msg, camera, stamp, bags.types)
     found.sort(key=lambda item: (item[0], ORDER.index(item[1])))

@@ -97,8 +97,7 @@ def _layout(footprints: list[float], seed: int) -> list[Array]:
             for _ in range(ATTEMPTS_PER_OBJECT):
                 place = _on_table(footprint, rng) if i < on_table else _around_table(rng)
                 if all(
-                    np.hypot(*(place - other)) > footprint + footprints[j] + CLEARANCE
-                    for j, other in enumerate(places)
+                    np.hypot(*(place - other)) > footprint + footprints[j] + CLEARANCE for j, other in enumerate(places)
                 ):
                     places.append(place)
                     break

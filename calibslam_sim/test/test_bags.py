@@ -159,9 +159,7 @@ def test_depth_is_written_in_millimetres(folder: Path, tmp_path: Path) -> None:
     assert np.frombuffer(bytes(depth.data), "<u2").tolist() == [0, 1000, 1, 13107] * 2
 
 
-def test_what_a_folder_lacks_is_said(
-    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_what_a_folder_lacks_is_said(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for name in ("odometry.txt", "groundtruth.txt", "detections.csv"):
         (folder / name).unlink()
     assert tum_to_bag.main([str(folder), "--out", str(tmp_path / "bag")]) == 0

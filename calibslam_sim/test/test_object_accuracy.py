@@ -29,18 +29,14 @@ def test_points_fill_the_cube_evenly() -> None:
 
 
 def test_nested_spheres_overlap_by_their_volumes() -> None:
-    assert iou(ellipsoid([1, 2, 3], [0.5] * 3), ellipsoid([1, 2, 3], [1.0] * 3)) == pytest.approx(
-        1 / 8, abs=0.005
-    )
+    assert iou(ellipsoid([1, 2, 3], [0.5] * 3), ellipsoid([1, 2, 3], [1.0] * 3)) == pytest.approx(1 / 8, abs=0.005)
 
 
 def test_shifted_spheres_overlap_by_their_lens() -> None:
     # Unit spheres at distance d share a lens of volume pi (4 + d) (2 - d)^2 / 12.
     lens = np.pi * 5.0 / 12.0
     expected = lens / (2.0 * 4.0 / 3.0 * np.pi - lens)
-    assert iou(ellipsoid([0, 0, 0], [1.0] * 3), ellipsoid([1, 0, 0], [1.0] * 3)) == pytest.approx(
-        expected, abs=0.005
-    )
+    assert iou(ellipsoid([0, 0, 0], [1.0] * 3), ellipsoid([1, 0, 0], [1.0] * 3)) == pytest.approx(expected, abs=0.005)
 
 
 @given(

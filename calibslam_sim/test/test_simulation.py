@@ -194,7 +194,6 @@ def test_missed_boxes_follow_the_miss_rate() -> None:
     times = stamps(5.0, 30.0)
     T = camera_path(times, 1.0, 0)
     counts = [
-        sum(len(boxes) for boxes in Detector(miss_rate=rate).detect(CAMERA, world, times, T, 0))
-        for rate in (0.0, 0.5)
+        sum(len(boxes) for boxes in Detector(miss_rate=rate).detect(CAMERA, world, times, T, 0)) for rate in (0.0, 0.5)
     ]
     assert counts[1] / counts[0] == pytest.approx(0.5, abs=0.05)

@@ -1,0 +1,199 @@
+"""`demo`: the whole system on a simulated recording, as separate processes, with a table of results.
+
+A desk is simulated and written to a bag. The bag is played to the odometry node and to two back ends: one
+believes every box alike, one believes each as much as its own covariance says. Both maps are compared with the
+truth.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import signal
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from calibslam_backend.object_map import ObjectMap
+from calibslam_msgs_py.bags import BagError, BagReader
+from calibslam_sim.evaluate import evaluate
+from calibslam_sim.processes import POLL, ProcessFailed, ProcessGroup
+from calibslam_sim.progress import Progress
+from calibslam_sim.reference import read_reference
+from calibslam_sim.simulate import write_bag
+from calibslam_sim.simulation import SCENARIOS, SimulationSettings, simulate
+
+START_TIMEOUT = 90.0  # [s] for all nodes to be there; compiling for the first time takes a while
+SAVE_TIMEOUT = 120.0  # [s]
+REFINEMENT = 1.5  # [s] without measurements until back ends have refined their maps
+LONGEST_REST = 1.5  # [s] without a keyframe; a map that ends earlier misses measurements
+SLACK = 120.0  # [s] that playing may take longer than it should
+
+
+@dataclass(frozen=True)
+class Condition:
+    """One back end of the demo: its namespace and folder, its noise model, what it is called in the table."""
+
+    name: str
+    noise_model: str
+    title: str
+
+
+CONDITIONS = (
+    Condition("fixed", "fixed", "SLAM, every edge 5 px"),
+    Condition("calibrated", "calibrated", "SLAM, each box's own covariance"),
+)
+
+
+def run_live(bag: Path, out: Path, rate: float) -> None:
+    """Play a bag to odometry and back ends, and have their maps and topics written to a folder each.
+
+    Raises:
+        ProcessFailed: a process died or did not end.
+    """
+    with BagReader(bag) as reader:
+        end, duration = reader.end, (reader.end - reader.start) * 1e-9
+    # Not to meet other nodes on this machine.
+    environment = {"ROS_DOMAIN_ID": os.environ.get("ROS_DOMAIN_ID", str(os.getpid() % 100 + 1))}
+    with ProcessGroup(out / "logs", environment) as processes:
+        processes.start("odometry", "calibslam_sim.odometry_node", [])
+        for condition in CONDITIONS:
+            namespace = ["--ros-args", "-r", f"__ns:=/{condition.name}"]
+            inputs = [
+                part
+                for topic in ("detections", "relative_pose", "camera/camera_info")
+                for part in ("-r", f"{topic}:=/{topic}")
+            ]
+            processes.start(
+                condition.name,
+                "calibslam_backend.backend_node",
+                [*namespace, *inputs, "-p", f"noise_model:={condition.noise_model}"],
+            )
+            processes.start(
+                f"{condition.name}_recorder",
+                "calibslam_sim.record_node",
+                [*namespace, "-p", f"out:={out / condition.name / 'run.mcap'}"],
+            )
+        everybody = {"/odom": 1, "/relative_pose": len(CONDITIONS), "/detections": len(CONDITIONS)}
+        waiting = [part for topic, n in everybody.items() for part in ("--wait-for", f"{topic}:{n}")]
+        processes.start(
+            "play",
+            "calibslam_sim.play_node",
+            [str(bag), "--rate", str(rate), *waiting, "--wait-timeout", str(START_TIMEOUT)],
+        )
+        _follow(processes, "play", duration / rate)
+        for condition in CONDITIONS:
+            _save(processes, condition.name, out / condition.name / "map.json", end)
+        processes.stop([f"{condition.name}_recorder" for condition in CONDITIONS])
+        processes.stop([condition.name for condition in CONDITIONS])
+        processes.stop(["odometry"])
+
+
+def _follow(processes: ProcessGroup, name: str, seconds: float) -> None:
+    """Wait for the player; it tells in its log how far it is, this tells how far it should be."""
+    begin = time.monotonic()
+    with Progress(seconds, "  playing") as progress:
+        while processes.is_running(name):
+            elapsed = time.monotonic() - begin
+            if elapsed > START_TIMEOUT + seconds + SLACK:
+                break
+            progress.at(min(elapsed, seconds))
+            time.sleep(POLL)
+    processes.wait(name, 1.0)
+
+
+def _save(processes: ProcessGroup, condition: str, path: Path, end: int) -> None:
+    """Have a back end write its map once it has used all measurements, up to `end` [ns].
+
+    Raises:
+        ProcessFailed: it does not get there within `SAVE_TIMEOUT`.
+    """
+    name = f"{condition}_save_map"
+    backend = ["--backend", f"/{condition}/backend", "--timeout", str(SAVE_TIMEOUT)]
+    give_up = time.monotonic() + SAVE_TIMEOUT
+    complete = False
+    while True:
+        was_complete = complete
+        time.sleep(REFINEMENT)
+        processes.start(name, "calibslam_sim.save_map_node", [str(path), *backend])
+        processes.wait(name, SAVE_TIMEOUT + START_TIMEOUT)
+        missing = (end - ObjectMap.load(path).stamps[-1]) * 1e-9
+        complete = missing < LONGEST_REST
+        if complete and was_complete:
+            return
+        if time.monotonic() > give_up:
+            raise ProcessFailed(f"the map in {path} misses the last {missing:.1f} s; try a lower --rate")
+
+
+def table(results: dict[str, dict[str, Any]]) -> str:
+    """Odometry alone against the back ends, for a person."""
+    first = results[CONDITIONS[0].name]
+    odometry = {key: first[f"odometry_{key}"] for key in ("ate_m", "rpe_m", "nees_position")}
+    rows = [("odometry alone", odometry)]
+    rows += [(condition.title, results[condition.name]) for condition in CONDITIONS]
+    lines = [f"{'':34}{'ATE [m]':>9}{'RPE [m]':>9}{'NEES':>8}{'objects':>12}{'3-D IoU':>9}"]
+    for title, metrics in rows:
+        objects = metrics.get("object_accuracy")
+        lines.append(
+            f"{title:34}{metrics['ate_m']:9.3f}{metrics['rpe_m']:9.4f}{metrics['nees_position']:8.2f}"
+            + (f"{objects['matched']:>6} of {objects['true']:<2}{objects['iou']:9.2f}" if objects else "")
+        )
+    lines += [
+        "",
+        "ATE: how far the trajectory is from the true one. RPE: the same from one keyframe to the next.",
+        "NEES: squared position error over stated variance; 3 is honest, more is overconfident.",
+    ]
+    return "\n".join(lines)
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Command line of `demo`; returns the exit code."""
+    parser = argparse.ArgumentParser(
+        prog="demo", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "--out", type=Path, default=Path("calibslam_demo"), help="folder to write (default: ./calibslam_demo)"
+    )
+    parser.add_argument("--scenario", choices=sorted(SCENARIOS), default="desk", help="(default: desk)")
+    parser.add_argument("--seed", type=int, default=0, help="(default: 0)")
+    parser.add_argument("--duration", type=float, default=60.0, metavar="S", help="(default: 60)")
+    parser.add_argument("--rate", type=float, default=4.0, help="times real time (default: 4)")
+    arguments = parser.parse_args(argv)
+    for ending in (signal.SIGTERM, signal.SIGHUP):
+        signal.signal(ending, signal.default_int_handler)
+    out = arguments.out.absolute()
+    bag = out / "bag"
+    begin = time.monotonic()
+
+    def say(text: str) -> None:
+        print(f"[{time.monotonic() - begin:5.1f} s] {text}", flush=True)
+
+    try:
+        settings = SimulationSettings(seed=arguments.seed, duration=arguments.duration, **SCENARIOS[arguments.scenario])
+        say(f"simulating {settings.duration:g} s of a camera walked around a desk")
+        write_bag(simulate(settings), bag, overwrite=True)
+        say(f"playing it at {arguments.rate:g} times its speed to odometry and {len(CONDITIONS)} back ends")
+        for condition in CONDITIONS:
+            (out / condition.name).mkdir(parents=True, exist_ok=True)
+        run_live(bag, out, arguments.rate)
+        say("comparing the maps with the truth")
+        reference = read_reference(bag)
+        results = {condition.name: evaluate(out / condition.name, reference) for condition in CONDITIONS}
+    except KeyboardInterrupt:
+        print("demo: interrupted", file=sys.stderr)
+        return 130
+    except (ProcessFailed, BagError, ValueError, OSError) as error:
+        print(f"demo: {error}", file=sys.stderr)
+        return 1
+    say("done")
+    print(f"\n{table(results)}\n")
+    for condition in CONDITIONS:
+        print(f"{out / condition.name}/: trajectory.png, map.json, metrics.json, run.mcap (opens in Foxglove)")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,130 @@
+"""`evaluate`: how good a run is, against the truth in a bag or a TUM folder.
+
+Reads map.json of the run; writes the result into its metrics.json, and trajectory.tum and trajectory.png anew.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from collections.abc import Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import gtsam
+import numpy as np
+
+from calibslam_backend.metrics import NoGroundTruth, Trajectory, alignment
+from calibslam_backend.object_map import MapFileError, ObjectMap, tum_lines
+from calibslam_backend.odometry import MotionChain, MotionNoise
+from calibslam_backend.plots import plot_run
+from calibslam_backend.quadric import Ellipsoid
+from calibslam_backend.run_folder import accuracy
+from calibslam_msgs_py.measurements import Array, RelativeMotion
+from calibslam_sim.object_accuracy import object_accuracy
+from calibslam_sim.reference import NoReference, Reference, read_reference
+
+
+def evaluate(folder: Path, reference: Reference) -> dict[str, Any]:
+    """Metrics of a RUN folder; writes metrics.json and the trajectory there.
+
+    Raises:
+        MapFileError: the run has no readable map.json.
+        NoGroundTruth: fewer than three keyframes have ground truth.
+    """
+    result = ObjectMap.load(folder / "map.json")
+    truth = reference.truth
+    T_world_map = alignment(Trajectory(np.array(result.stamps), result.poses), truth)
+    found: dict[str, Any] = accuracy(result.stamps, result.poses, result.covariances, truth)
+    found |= {"keyframes": len(result.stamps), "objects": len(result.quadrics)}
+    odometry = odometry_at(result, reference.motions)
+    if odometry is not None:
+        found |= accuracy(result.stamps, *odometry, truth, "odometry_")
+    if reference.objects is not None:
+        estimated = [Ellipsoid(T_world_map @ q.T_map_object, q.radii) for q in result.quadrics]
+        found["object_accuracy"] = asdict(object_accuracy(estimated, reference.objects))
+    (folder / "trajectory.tum").write_text(tum_lines(result.stamps, result.poses), encoding="utf-8")
+    path = folder / "metrics.json"
+    before = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
+    path.write_text(json.dumps({**before, **found}, indent=1) + "\n", encoding="utf-8")
+    if odometry is not None:
+        plot_run(folder / "trajectory.png", folder.name, result, odometry[0], truth)
+    return found
+
+
+def odometry_at(result: ObjectMap, motions: Sequence[RelativeMotion]) -> tuple[Array, Array] | None:
+    """Poses (N, 4, 4) of the keyframes by odometry alone, from the first one on, with covariances (N, 6, 6).
+
+    None where odometry does not cover the keyframes, or moves another body than the camera.
+    """
+    if not motions or any(motion.frame_id != result.camera for motion in motions):
+        return None
+    if motions[0].start > result.stamps[0] or motions[-1].end < result.stamps[-1]:
+        return None
+    chain = MotionChain(MotionNoise(), np.eye(4))
+    for motion in motions:
+        chain.add(motion)
+    poses, covariances = [result.poses[0]], [result.covariances[0]]
+    for start, end in zip(result.stamps[:-1], result.stamps[1:], strict=True):
+        step, noise = chain.between(start, end)
+        back = gtsam.Pose3(step).inverse().AdjointMap()
+        poses.append(poses[-1] @ step)
+        covariances.append(back @ covariances[-1] @ back.T + noise)
+    return np.stack(poses), np.stack(covariances)
+
+
+def table(metrics: dict[str, Any]) -> str:
+    """The metrics for a person."""
+    lines = [
+        f"{'':24}{'estimate':>12}{'odometry alone':>16}",
+        _row("ATE [m]", metrics, "ate_m", "{:.3f}"),
+        _row("RPE [m]", metrics, "rpe_m", "{:.4f}"),
+        _row("NEES (3 is honest)", metrics, "nees_position", "{:.2f}"),
+        f"{'keyframes':24}{metrics['keyframes']:>12}",
+        f"{'objects':24}{metrics['objects']:>12}",
+    ]
+    objects = metrics.get("object_accuracy")
+    if objects:
+        lines += [
+            f"{'  of true ones':24}{objects['matched']:>7} of {objects['true']}",
+            f"{'  centre error [m]':24}{objects['centre_m']:>12.3f}",
+            f"{'  error of radii':24}{objects['radii']:>12.0%}",
+            f"{'  3-D IoU':24}{objects['iou']:>12.2f}",
+        ]
+    return "\n".join(lines)
+
+
+def _row(name: str, metrics: dict[str, Any], key: str, style: str) -> str:
+    values = [metrics.get(prefix + key) for prefix in ("", "odometry_")]
+    texts = ["-" if value is None else style.format(value) for value in values]
+    return f"{name:24}{texts[0]:>12}{texts[1]:>16}"
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Command line of `evaluate`; returns the exit code."""
+    parser = argparse.ArgumentParser(
+        prog="evaluate", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("run", type=Path, metavar="RUN", help="folder that slam_bag or save_map wrote")
+    parser.add_argument(
+        "--reference",
+        type=Path,
+        required=True,
+        metavar="BAG_OR_TUM",
+        help="bag with /ground_truth, folder in TUM format, or file of poses in TUM format",
+    )
+    parser.add_argument("--json", action="store_true", help="print JSON instead of a table")
+    arguments = parser.parse_args(argv)
+    try:
+        metrics = evaluate(arguments.run, read_reference(arguments.reference))
+    except (MapFileError, NoGroundTruth, NoReference) as error:
+        print(f"evaluate: {error}", file=sys.stderr)
+        return 1
+    print(json.dumps(metrics, indent=1) if arguments.json else table(metrics))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
