@@ -32,6 +32,7 @@ class ProcessGroup:
         self._logs = logs
         self._environment = {**os.environ, **environment, "PYTHONUNBUFFERED": "1"}
         self._running: dict[str, subprocess.Popen[bytes]] = {}
+        self._may_end: set[str] = set()
         logs.mkdir(parents=True, exist_ok=True)
 
     def __enter__(self) -> ProcessGroup:
@@ -42,8 +43,10 @@ class ProcessGroup:
     ) -> None:
         self.stop()
 
-    def start(self, name: str, module: str, arguments: Sequence[str]) -> None:
-        """Start `python -m module`; its log is called by `name`."""
+    def start(self, name: str, module: str, arguments: Sequence[str], may_end: bool = False) -> None:
+        """Start `python -m module`; its log is called by `name`. One that `may_end` does so with 0 at any time."""
+        if may_end:
+            self._may_end.add(name)
         with open(self._logs / f"{name}.log", "wb") as log:
             self._running[name] = subprocess.Popen(
                 [sys.executable, "-m", module, *arguments],
@@ -60,11 +63,10 @@ class ProcessGroup:
         Raises:
             ProcessFailed: it, or one of the others, ended otherwise than asked for.
         """
-        code = self._running[name].poll()
-        for other in [n for n in self._running if n != name or code]:
-            if self._running[other].poll() is not None:
+        for other, process in self._running.items():
+            if process.poll() or (process.returncode == 0 and other not in (name, *self._may_end)):
                 raise self._failure(other)
-        return code is None
+        return self._running[name].returncode is None
 
     def wait(self, name: str, timeout: float) -> None:
         """Until a process has ended with 0, while the others run.
