@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from evo.core import metrics, sync
+from evo.core.geometry import GeometryException
 from evo.core.trajectory import PoseTrajectory3D
 from scipy.spatial.transform import Rotation, Slerp
 
@@ -30,7 +31,7 @@ class Trajectory:
 
 
 class NoGroundTruth(ValueError):
-    """Estimate and ground truth have too few times in common."""
+    """Estimate and ground truth have too few times in common, or do not determine an alignment."""
 
 
 def _matched(estimate: Trajectory, truth: Trajectory) -> tuple[PoseTrajectory3D, PoseTrajectory3D]:
@@ -43,15 +44,24 @@ def _matched(estimate: Trajectory, truth: Trajectory) -> tuple[PoseTrajectory3D,
     return reference, matched
 
 
+def _align(matched: PoseTrajectory3D, reference: PoseTrajectory3D) -> tuple[Array, Array]:
+    """Move a trajectory to its best SE(3) alignment; returns that rotation (3, 3) and translation (3,)."""
+    try:
+        R, t, _ = matched.align(reference, correct_scale=False)
+    except GeometryException as error:
+        raise NoGroundTruth("the camera stands still or moves on a line: no alignment is determined") from error
+    return R, t
+
+
 def ate(estimate: Trajectory, truth: Trajectory) -> float:
     """Absolute trajectory error [m], rms after SE(3) alignment without scale.
 
     Raises:
-        NoGroundTruth: fewer than three keyframes have ground truth.
+        NoGroundTruth: fewer than three keyframes have ground truth, or all on a line.
     """
     reference, matched = _matched(estimate, truth)
     aligned = copy.deepcopy(matched)
-    aligned.align(reference, correct_scale=False)
+    _align(aligned, reference)
     metric = metrics.APE(metrics.PoseRelation.translation_part)
     metric.process_data((reference, aligned))
     return float(metric.get_statistic(metrics.StatisticsType.rmse))
@@ -72,10 +82,10 @@ def alignment(estimate: Trajectory, truth: Trajectory) -> Array:
     """(4, 4) T_world_map of the best SE(3) alignment.
 
     Raises:
-        NoGroundTruth: fewer than three keyframes have ground truth.
+        NoGroundTruth: fewer than three keyframes have ground truth, or all on a line.
     """
     reference, matched = _matched(estimate, truth)
-    R, t, _ = copy.deepcopy(matched).align(reference, correct_scale=False)
+    R, t = _align(copy.deepcopy(matched), reference)
     T = np.eye(4)
     T[:3, :3], T[:3, 3] = R, t
     return T
