@@ -55,9 +55,7 @@ def jacobians(factor: gtsam.CustomFactor, values: gtsam.Values) -> tuple[Array, 
     k=st.sampled_from([0.5, 2.0, 1e6]),
     place=st.sampled_from([(0.1, 0.05, 2.0), (1.2, 0.1, 2.0), (1.15, 0.9, 2.0), (3.0, 0.0, 2.0), (0.1, 0.0, 0.35)]),
 )
-def test_linearisation(
-    direction: tuple[float, ...], size: float, k: float, place: tuple[float, float, float]
-) -> None:
+def test_linearisation(direction: tuple[float, ...], size: float, k: float, place: tuple[float, float, float]) -> None:
     """In the image, at its border, outside and near the camera plane, for tiny and for gross errors."""
     quadric = quadric_at(*place)
     offset = size * np.array(direction) / np.linalg.norm(direction)
@@ -103,7 +101,9 @@ def test_an_edge_on_the_border_is_met_by_whatever_lies_beyond() -> None:
         np.testing.assert_allclose(rest[2], 0.0, atol=1e-9)
     short = predicted(quadric_at(0.1, 0.1, 2.0))
     reaching = np.where(clip, 640.0, short)
-    assert np.linalg.norm(factor_of(reaching, 2.0, clip).unwhitenedError(values_of(POSE, quadric_at(0.1, 0.1, 2.0)))) > 3
+    assert (
+        np.linalg.norm(factor_of(reaching, 2.0, clip).unwhitenedError(values_of(POSE, quadric_at(0.1, 0.1, 2.0)))) > 3
+    )
 
 
 @pytest.mark.parametrize("z", [-2.0, -0.05, 0.0, 0.05, 0.1])

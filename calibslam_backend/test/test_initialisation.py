@@ -1,0 +1,125 @@
+"""A first quadric from boxes: exact where they are exact, honest about its error, silent where they do not tell."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.stats import chi2
+from small_world import CAMERA, around, looking_at, objects
+
+from calibslam_backend.box_measurement import BoxMeasurement
+from calibslam_backend.initialisation import InitialisationSettings, Initialised, initialise
+from calibslam_backend.quadric import ALL_EDGES, Ellipsoid, box_of_visible_part, image_bounds
+from calibslam_msgs_py.measurements import Array
+
+BOUNDS = image_bounds(CAMERA.width, CAMERA.height)
+LINEAR = 1e6  # robust scale of a loss that is not robust
+# A prior that hardly counts: what is tested is what the boxes say.
+LOOSE = InitialisationSettings(prior_centre=1e3, prior_shape=1e2)
+
+
+def measured(ellipsoid: Ellipsoid, poses: Array, sigma: float = 1.0, rng: np.random.Generator | None = None) -> list:
+    boxes = []
+    for pose in poses:
+        visible, corners, _ = box_of_visible_part(pose, ellipsoid.vector(), CAMERA.K, BOUNDS, ALL_EDGES)
+        assert visible
+        clip = (corners == BOUNDS) if rng is None else np.zeros(4, bool)
+        noise = sigma * rng.normal(size=4) if rng else 0.0
+        boxes.append(BoxMeasurement(corners + noise, np.eye(4) / sigma, BOUNDS, np.asarray(clip)))
+    return boxes
+
+
+def start(poses: Array, boxes: list, settings: InitialisationSettings = LOOSE) -> Initialised | None:
+    return initialise(poses, boxes, CAMERA.K, LINEAR, settings)
+
+
+@pytest.mark.parametrize("index", range(9))
+def test_exact_boxes_give_the_exact_ellipsoid(index: int) -> None:
+    truth, poses = objects()[index], around(12)
+    found = start(poses, measured(truth, poses))
+    assert found is not None
+    np.testing.assert_allclose(found.vector, truth.vector(), atol=2e-3)
+    assert found.distances.max() < 0.01
+
+
+def test_boxes_cut_by_the_image_are_no_smaller_objects() -> None:
+    """Half of the views show the object at the border; taking those edges as its own would shrink it."""
+    truth, poses = objects()[4], around(12)
+    for k in range(0, 12, 2):
+        position = poses[k, :3, 3]
+        aside = np.cross(-position, [0.0, 0.0, 1.0])
+        poses[k] = looking_at(position, 1.05 * aside / np.linalg.norm(aside) + [0.0, 0.0, 0.1])
+    boxes = measured(truth, poses)
+    assert sum(box.clip.any() for box in boxes) == 6
+    found = start(poses, boxes)
+    assert found is not None
+    np.testing.assert_allclose(found.vector, truth.vector(), atol=5e-3)
+
+
+def test_too_few_boxes() -> None:
+    truth, poses = objects()[0], around(12)
+    settings = InitialisationSettings(min_boxes=6)
+    assert start(poses[:5], measured(truth, poses[:5]), settings) is None
+    assert start(poses[::2], measured(truth, poses[::2]), settings) is not None
+
+
+def test_parallel_rays_do_not_tell_the_distance() -> None:
+    truth = objects()[4]
+    still = np.repeat(around(1), 10, axis=0)
+    still[:, :3, 3] += np.random.default_rng(0).normal(0.0, 1e-4, size=(10, 3))
+    assert initialise(still, measured(truth, still), CAMERA.K, 2.0, InitialisationSettings()) is None
+
+
+def test_an_object_behind_the_camera_is_none() -> None:
+    """Boxes that move the wrong way while the camera moves aside: their rays meet behind it."""
+    truth, first = objects()[4], around(1)[0]
+    poses = np.repeat(first[None], 12, axis=0)
+    aside = np.linspace(-0.3, 0.3, 12)
+    poses[:, :3, 3] += aside[:, None] * first[:3, 0]
+    boxes = measured(truth, poses)
+    assert start(poses, boxes) is not None
+    assert start(poses[::-1].copy(), boxes) is None
+
+
+def test_boxes_of_two_objects_are_refused() -> None:
+    first, second, poses = objects()[0], objects()[8], around(12)
+    mixed = [(a, b)[k % 2] for k, (a, b) in
+             enumerate(zip(measured(first, poses), measured(second, poses), strict=True))]  # fmt: skip
+    assert initialise(poses, mixed, CAMERA.K, 2.0, InitialisationSettings()) is None
+
+
+def test_more_boxes_than_wanted_are_thinned() -> None:
+    truth, poses = objects()[1], around(60)
+    found = start(poses, measured(truth, poses), InitialisationSettings(max_boxes=10))
+    assert found is not None and len(found.distances) == 10
+
+
+def test_one_gross_box_does_no_harm() -> None:
+    truth, poses = objects()[2], around(15)
+    boxes = measured(truth, poses)
+    boxes[7] = BoxMeasurement(boxes[7].corners + 150.0, boxes[7].whitener, BOUNDS, boxes[7].clip)
+    robust = initialise(poses, boxes, CAMERA.K, 2.0, LOOSE)
+    assert robust is not None
+    np.testing.assert_allclose(robust.vector, truth.vector(), atol=0.02)
+    linear = initialise(poses, boxes, CAMERA.K, LINEAR, InitialisationSettings(max_residual=1e3))
+    assert linear is None or np.abs(linear.vector - truth.vector()).max() > 0.05
+
+
+def test_covariance_is_honest() -> None:
+    """Mean NEES of the 9-vector over 200 noisy objects lies in its 99.9 % interval, and so does its coverage.
+
+    With the right covariance the sum of 200 squared distances is chi-squared with 1,800 degrees of freedom, if
+    the model is linear within the noise (1 px on boxes of 60 px and more).
+    """
+    rng = np.random.default_rng(4)
+    poses, squared = around(25), []
+    for n in range(200):
+        truth = objects()[n % 9]
+        found = start(poses, measured(truth, poses, 1.0, rng))
+        assert found is not None
+        error = found.vector - truth.vector()
+        squared.append(error @ np.linalg.solve(found.covariance, error))
+    low, high = chi2.ppf([0.0005, 0.9995], 9 * 200) / 200
+    assert low < np.mean(squared) < high
+    inside = np.mean(np.array(squared) < chi2.ppf(0.9, 9))
+    assert 0.83 < inside < 0.96  # 0.9 +- 3.3 standard deviations of a share of 200
