@@ -39,6 +39,7 @@ from calibslam_backend.noise import NoiseModel, NoiseSettings
 from calibslam_backend.object_map import ObjectMap
 from calibslam_backend.odometry import SECOND, MotionChain, MotionNoise
 from calibslam_backend.quadric import Ellipsoid, covariance_of_pose_and_radii, covariance_of_vector
+from calibslam_backend.relocalisation import RelocalisationSettings, relocalise
 from calibslam_backend.tracking import Tracker, TrackingSettings, overlap, unique
 from calibslam_msgs_py.measurements import (
     Array,
@@ -65,6 +66,7 @@ class EstimatorSettings(
     KeyframeSettings,
     TrackingSettings,
     InitialisationSettings,
+    RelocalisationSettings,
     GraphSettings,
     MotionNoise,
 ):
@@ -111,6 +113,7 @@ class Estimator:
     # A bound track whose boxes miss their quadric so often in a row has slipped to another object.
     MAX_MISFITS = 3
     LEAST_FIT = 0.1  # overlap of a box with its quadric's that is no misfit
+    YOUNG = 30  # keyframes during which a quadric may turn out to be one that was known before
 
     def __init__(self, camera: Camera, T_body_camera: Array, settings: EstimatorSettings) -> None:
         load_kernels()
@@ -348,6 +351,7 @@ class Estimator:
         used = self._give_to_bound(k, tracks, measurements)
         if k:
             self._vote(k, tracks, measurements, covariance)
+            self._relocalise(k, tracks, measurements)
         for track, box in zip(tracks, measurements, strict=True):
             candidate = self._candidates[track]
             if candidate.landmark is None:
@@ -439,9 +443,56 @@ class Estimator:
         cost = distances(predictions, [measurements[i] for i in rows], classes, self.settings)
         for p, r in assign(cost):
             track = tracks[rows[r]]
-            landmark = self._votes.add(track, predictions[p].landmark)
-            if landmark is not None and not self._seen_apart(self._candidates[track], landmark):
-                self._bind(track, landmark)
+            self._vote_for(track, predictions[p].landmark)
+
+    def _vote_for(self, track: int, landmark: int) -> None:
+        decided = self._votes.add(track, landmark)
+        if decided is not None and not self._seen_apart(self._candidates[track], decided):
+            self._bind(track, decided)
+
+    def _relocalise(self, k: int, tracks: list[int], measurements: list[BoxMeasurement]) -> None:
+        """Where the boxes show known objects from another pose than the predicted one, vote for those."""
+        if self.settings.association == GIVEN or not any(self._recent(t, k) for t in tracks):
+            return
+        known = [j for j, landmark in self._graph.landmarks.items() if landmark.factors]
+        if not known:
+            return
+        classes = [self._class_of(t) for t in tracks]
+        compatible = np.array([[self._classes[j].most_common(1)[0][0] == c for j in known] for c in classes])
+        # A young quadric is what is in question: it may be an old one, seen from where the camera is not.
+        for m, j in enumerate(known):
+            if k - self._graph.landmarks[j].born <= self.YOUNG:
+                compatible[:, m] = False
+        found = relocalise(
+            self._graph.pose(k),
+            measurements,
+            np.stack([self._graph.quadric(j) for j in known]),
+            compatible,
+            self.camera.K,
+            (self.camera.width, self.camera.height),
+            self.settings.robust_scale,
+            self.settings,
+        )
+        if found is None:
+            return
+        self.counts["relocalised"] += 1
+        for n, m in found.pairs:
+            bound = self._candidates[tracks[n]].landmark
+            if bound is None:
+                self._vote_for(tracks[n], known[m])
+            elif bound != known[m] and self._votes.add(~bound, known[m]) == known[m]:
+                self._unite(bound, known[m])
+
+    def _class_of(self, track: int) -> str:
+        """The class most boxes of a track, or of the quadric it is bound to, carry."""
+        candidate = self._candidates[track]
+        classes = candidate.classes if candidate.landmark is None else self._classes[candidate.landmark]
+        return classes.most_common(1)[0][0]
+
+    def _recent(self, track: int, k: int) -> bool:
+        """Whether a track is open, or bound to a young quadric."""
+        landmark = self._candidates[track].landmark
+        return landmark is None or k - self._graph.landmarks[landmark].born <= self.YOUNG
 
     def _near(self, T_map_camera: Array, j: int, boxes: list[BoxMeasurement]) -> bool:
         """Whether the box a quadric predicts comes within its own size of one of these boxes."""
@@ -529,16 +580,23 @@ class Estimator:
                     break
             if target is None:
                 continue
-            self._graph.remove_quadric(j)
-            for k, box in boxes:
-                self._graph.add_box(k, target, box)
-            self._classes[target] += self._classes.pop(j)
-            for candidate in self._candidates.values():
-                if candidate.landmark == j:
-                    candidate.landmark = target
-            self.counts["merged"] += 1
+            self._unite(j, target)
             gone.append(j)
         return gone
+
+    def _unite(self, j: int, target: int) -> None:
+        """Quadric j is the same object as another, which gets its boxes."""
+        boxes = list(self._graph.landmarks[j].boxes)
+        self._graph.remove_quadric(j)
+        seen = {k for k, _ in self._graph.landmarks[target].boxes}
+        for k, box in boxes:
+            if k not in seen:
+                self._graph.add_box(k, target, box)
+        self._classes[target] += self._classes.pop(j)
+        for candidate in self._candidates.values():
+            if candidate.landmark == j:
+                candidate.landmark = target
+        self.counts["merged"] += 1
 
     def _note(self, report: object) -> None:
         """Book what the graph took out: its tracks are open again."""

@@ -9,7 +9,6 @@ the tree anew without the quadric at fault, and both are reported.
 from __future__ import annotations
 
 import logging
-import re
 from dataclasses import dataclass, field
 
 import gtsam
@@ -40,9 +39,9 @@ class GraphSettings(Settings):
         3.0, "Mahalanobis distance from which a motion counts as doubtful", low=0.1, high=1e6
     )
     prior_sigma: float = setting(0.001, "first pose: it is the map's origin", unit="rad and m", low=1e-6)
-    relinearise_every: int = setting(10, "keyframes between relinearisations of the whole graph", low=1)
-    relinearise_pose: float = setting(0.05, "change of a pose that asks for one", unit="rad and m", low=0.0)
-    relinearise_quadric: float = setting(0.1, "change of a quadric that asks for one", unit="m and log m", low=0.0)
+    relinearise_every: int = setting(3, "keyframes between relinearisations of the whole graph", low=1)
+    relinearise_pose: float = setting(0.01, "change of a pose that asks for one", unit="rad and m", low=0.0)
+    relinearise_quadric: float = setting(0.03, "change of a quadric that asks for one", unit="m and log m", low=0.0)
     young: int = setting(20, "keyframes during which a quadric is relinearised at once", low=0)
 
 
@@ -59,7 +58,7 @@ class Landmark:
 
 @dataclass(frozen=True)
 class UpdateReport:
-    """What an update did: quadrics that were taken out by id, and the reason if the tree was built anew."""
+    """What an update did: quadrics that run away and will be taken out by the next, and why the tree was built anew."""
 
     removed: list[int]
     repaired: str = ""
@@ -70,11 +69,13 @@ class ObjectGraph:
 
     # A quadric beyond these is no object any more [m].
     LARGEST_RADIUS, LARGEST_DISTANCE, SMALLEST_RADIUS = 10.0, 200.0, 1e-4
+    LARGEST_STEP = 0.5  # [rad, m] of a pose in one update; more is checked by a damped optimisation
+    BATCH_ITERATIONS = 100
 
     def __init__(self, K: Array, settings: GraphSettings, priors: InitialisationSettings) -> None:
         self._K = np.ascontiguousarray(K, float)
         self._settings = settings
-        self._sigmas = priors.prior_sigmas()
+        self._prior = priors.prior_covariance()
         self._motions: list[tuple[Array, Array]] = []  # between consecutive poses, with covariance
         self.landmarks: dict[int, Landmark] = {}
         self._origin = gtsam.Pose3(T_MAP_FIRST_CAMERA)
@@ -139,6 +140,8 @@ class ObjectGraph:
         """The first pose."""
         self._has_origin = True
         self._add_origin_factor()
+        for values in (self._new_values, self._values):
+            values.insert(symbol("x", 0), self._origin)
 
     def add_pose(self, motion: Array, covariance: Array, guess: Array) -> int:
         """The next pose, after a motion (4, 4) from the last one with covariance (6, 6); returns its number.
@@ -154,7 +157,7 @@ class ObjectGraph:
 
     def add_quadric(self, j: int, vector: Array) -> None:
         """A new quadric, first seen as this vector (9,)."""
-        self.add_known_quadric(j, vector, np.diag(self._sigmas**2))
+        self.add_known_quadric(j, vector, self._prior)
 
     def add_known_quadric(self, j: int, vector: Array, covariance: Array) -> None:
         """A quadric that is known as well as this covariance (9, 9) says."""
@@ -181,33 +184,26 @@ class ObjectGraph:
     def update(self, everything: bool = False) -> UpdateReport:
         """One step of ISAM2; `everything` relinearises whatever has moved."""
         self._updates += 1
-        repaired = ""
+        before = gtsam.Values(self._values)
+        reason = ""
         try:
             self._step(everything or self._updates % self._settings.relinearise_every == 0)
+            if self._jumped(before):
+                reason = "the trajectory jumped"
         except RuntimeError as error:
-            repaired = self._repair(error)
+            reason = _first_sentence(error)
+        if reason:
+            log.warning("%s; optimising the whole graph from the estimate before", reason)
+            self._repair(before)
         removed = [j for j in self.landmarks if not self._sane(j)]
-        if removed:
-            for j in removed:
-                log.warning("quadric %d ran away and was taken out", j)
-                self.remove_quadric(j)
-            try:
-                self._step(False)
-            except RuntimeError as error:
-                repaired = self._repair(error)
-        return UpdateReport(removed, repaired)
+        for j in removed:
+            log.warning("quadric %d ran away and is taken out", j)
+            self.remove_quadric(j)
+        return UpdateReport(removed, reason)
 
     def optimise(self) -> None:
         """The batch optimum by Levenberg-Marquardt, from which the tree is built anew."""
-        graph = gtsam.NonlinearFactorGraph()
-        held = self._isam.getFactorsUnsafe()
-        for i in range(held.size()):
-            if held.exists(i):
-                graph.push_back(held.at(i))
-        parameters = gtsam.LevenbergMarquardtParams()
-        parameters.setMaxIterations(100)
-        self._values = gtsam.LevenbergMarquardtOptimizer(graph, self._values, parameters).optimize()
-        self._rebuild()
+        self._rebuild(self._levenberg_marquardt(self._values))
 
     def _step(self, everything: bool) -> None:
         changes = gtsam.ISAM2UpdateParams()
@@ -252,44 +248,56 @@ class ObjectGraph:
             and np.linalg.norm(vector[:3] - self.pose(self.size - 1)[:3, 3]) < self.LARGEST_DISTANCE
         )
 
-    def _repair(self, error: RuntimeError) -> str:
-        """Build the tree anew from the last good estimate, without the quadric the error names, if it names one."""
-        named = re.search(r"Symbol: ([a-z])(\d+)", str(error))
-        reason = f"update failed near {named[1]}{named[2]}" if named else f"update failed: {error}"
-        suspects = {int(named[2])} if named and named[1] == "q" else set()
-        # A pose is held by odometry; where the error names one, the fault lies with a quadric it sees.
-        if named and named[1] == "x":
-            k = int(named[2])
-            suspects = {j for j, m in self.landmarks.items() if any(n == k for n, _ in m.boxes)}
-            suspects = {max(suspects, key=lambda j: self.landmarks[j].born)} if suspects else set()
-        log.warning("%s; rebuilding without quadrics %s", reason, sorted(suspects) or "removed")
-        for j in suspects & set(self.landmarks):
-            del self.landmarks[j]
-        try:
-            self._rebuild()
-        except RuntimeError as again:
-            if not self.landmarks:
-                raise
-            return f"{reason}; {self._repair(again)}"
-        return reason
+    def _jumped(self, before: gtsam.Values) -> bool:
+        """Whether a pose moved farther than an undamped step can be trusted with."""
+        for k in range(self.size):
+            step = gtsam.Pose3.Logmap(before.atPose3(symbol("x", k)).between(self._values.atPose3(symbol("x", k))))
+            if not np.isfinite(step).all() or np.abs(step).max() > self.LARGEST_STEP:
+                return True
+        return False
 
-    def _rebuild(self) -> None:
-        """A new tree of all factors, linearised at the current estimate."""
-        self._isam = self._new_isam()
-        estimate = self._values
+    def _repair(self, before: gtsam.Values) -> None:
+        """Optimise the whole graph with damping from an estimate that was good, and build the tree anew.
+
+        If even that fails, quadrics are given up, the youngest first.
+        """
+        while True:
+            try:
+                self._rebuild(self._levenberg_marquardt(before))
+                return
+            except RuntimeError as error:
+                if not self.landmarks:
+                    raise
+                youngest = max(self.landmarks, key=lambda j: self.landmarks[j].born)
+                log.warning("%s; giving up quadric %d", _first_sentence(error), youngest)
+                del self.landmarks[youngest]
+                before.erase(symbol("q", youngest))
+
+    def _levenberg_marquardt(self, values: gtsam.Values) -> gtsam.Values:
         self._begin_change()
-        self._add_origin_factor(insert=False)
+        self._add_all_factors()
+        parameters = gtsam.LevenbergMarquardtParams()
+        parameters.setMaxIterations(self.BATCH_ITERATIONS)
+        return gtsam.LevenbergMarquardtOptimizer(self._new_factors, values, parameters).optimize()
+
+    def _rebuild(self, values: gtsam.Values) -> None:
+        """A new tree of all factors, linearised at these values."""
+        self._isam = self._new_isam()
+        self._begin_change()
+        self._add_all_factors()
+        self._new_values = values
+        for landmark in self.landmarks.values():
+            landmark.factors = []
+        self._step(True)
+
+    def _add_all_factors(self) -> None:
+        self._add_origin_factor()
         for k in range(1, self.size):
             self._add_motion_factor(k)
-        for k in range(self.size):
-            self._new_values.insert(symbol("x", k), estimate.atPose3(symbol("x", k)))
         for j, landmark in self.landmarks.items():
-            landmark.factors = []
-            self._new_values.insert(symbol("q", j), estimate.atVector(symbol("q", j)))
             self._add_prior_factor(j)
             for k, box in landmark.boxes:
                 self._add_box_factor(k, j, box)
-        self._step(True)
 
     def _new_isam(self) -> gtsam.ISAM2:
         parameters = gtsam.ISAM2Params()
@@ -315,12 +323,9 @@ class ObjectGraph:
         self._new_factors.push_back(factor)
         self._owners.append(owner)
 
-    def _add_origin_factor(self, insert: bool = True) -> None:
+    def _add_origin_factor(self) -> None:
         noise = gtsam.noiseModel.Isotropic.Sigma(6, self._settings.prior_sigma)
         self._add(gtsam.PriorFactorPose3(symbol("x", 0), self._origin, noise))
-        if insert:
-            self._new_values.insert(symbol("x", 0), self._origin)
-            self._values.insert(symbol("x", 0), self._origin)
 
     def _add_motion_factor(self, k: int) -> None:
         motion, covariance = self._motions[k - 1]
@@ -337,3 +342,8 @@ class ObjectGraph:
 
     def _add_box_factor(self, k: int, j: int, box: BoxMeasurement) -> None:
         self._add(box_factor(symbol("x", k), symbol("q", j), box, self._K, self._settings.robust_scale), j)
+
+
+def _first_sentence(error: RuntimeError) -> str:
+    """GTSAM's messages are pages long."""
+    return " ".join(str(error).split("Thrown when")[0].split())

@@ -26,16 +26,25 @@ class InitialisationSettings(Settings):
     min_boxes: int = setting(4, "boxes an object needs", low=3)
     max_boxes: int = setting(40, "boxes of an object that are looked at", low=3)
     max_depth_uncertainty: float = setting(
-        0.25, "largest standard deviation of the centre, as a share of its distance", low=0.0, high=1.0
+        0.1, "largest standard deviation of the centre, as a share of its distance", low=0.0, high=1.0
     )
     max_residual: float = setting(3.0, "largest median distance of a box, in standard deviations", low=0.1)
     max_radius: float = setting(3.0, "largest semi-axis", unit="m", low=0.01)
     prior_centre: float = setting(10.0, "weak prior on the centre of a quadric", unit="m", low=1e-3)
-    prior_shape: float = setting(0.3, "prior on the shape of a quadric: logarithm of its radii", low=1e-3)
+    prior_shape: float = setting(0.3, "prior on the proportions of a quadric: logarithm of its radii", low=1e-3)
+    prior_size: float = setting(1.0, "weak prior on the size of a quadric: logarithm of its radii", low=1e-3)
 
-    def prior_sigmas(self) -> Array:
-        """(9,) standard deviations of centre and logarithmic shape."""
-        return np.repeat([self.prior_centre, self.prior_shape], [3, 6])
+    def prior_covariance(self) -> Array:
+        """(9, 9) of centre and logarithmic shape around the first guess.
+
+        The first guess knows proportions, but hardly sizes: early objects all share the error that odometry had
+        made by then, and a prior on their sizes would make it the scale of the map.
+        """
+        covariance = np.eye(9) * self.prior_centre**2
+        size = np.array([1.0, 1.0, 1.0, 0.0, 0.0, 0.0]) / np.sqrt(3.0)
+        share = np.outer(size, size)
+        covariance[3:, 3:] = self.prior_shape**2 * (np.eye(6) - share) + self.prior_size**2 * share
+        return covariance
 
 
 @dataclass(frozen=True)
@@ -84,7 +93,7 @@ def initialise(
         bounds,
         clip,
         robust_scale,
-        settings.prior_sigmas(),
+        np.linalg.inv(settings.prior_covariance()),
     )
     covariance = np.linalg.inv(information)
     depth = np.median(np.linalg.norm(poses[:, :3, 3] - vector[:3], axis=1))
@@ -140,17 +149,20 @@ def _normal_equations(poses, vector, K, corners, whiteners, bounds, clip, k, A, 
 
 
 @numba.njit(cache=True)
-def _refine(poses, guess, K, corners, whiteners, bounds, clip, k, sigmas):  # type: ignore[no-untyped-def]
-    """Levenberg-Marquardt over one quadric, its prior at the guess; returns vector, information and distances."""
+def _refine(poses, guess, K, corners, whiteners, bounds, clip, k, prior):  # type: ignore[no-untyped-def]
+    """Levenberg-Marquardt over one quadric; the prior (9, 9 information) sits at the guess.
+
+    Returns vector (9,), information (9, 9) and the distance of each box.
+    """
     distances, scratch = np.empty(len(poses)), np.empty(len(poses))
     damping, cost = 1e-2, np.inf
     A, b, step = np.empty((9, 9)), np.empty(9), np.zeros(9)
-    best, A_best, b_best = guess.copy(), np.diag(1.0 / sigmas**2), np.zeros(9)
+    best, A_best, b_best = guess.copy(), prior.copy(), np.zeros(9)
     for _ in range(50):
         vector = best + step
-        A[:] = np.diag(1.0 / sigmas**2)
-        b[:] = (guess - vector) / sigmas**2
-        c = (((guess - vector) / sigmas) ** 2).sum()
+        A[:] = prior
+        b[:] = prior @ (guess - vector)
+        c = (guess - vector) @ b
         c += _normal_equations(poses, vector, K, corners, whiteners, bounds, clip, k, A, b, scratch)
         if c <= cost:
             converged = cost - c < 1e-4 * c

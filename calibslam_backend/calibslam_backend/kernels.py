@@ -12,6 +12,7 @@ from calibslam_backend.box_measurement import BoxMeasurement
 from calibslam_backend.initialisation import InitialisationSettings, initialise
 from calibslam_backend.localisation import localise
 from calibslam_backend.quadric import ALL_EDGES, Ellipsoid, box_of_visible_part
+from calibslam_backend.relocalisation import overlaps_at
 
 
 @functools.cache
@@ -30,4 +31,7 @@ def load_kernels() -> None:
     values.insert(1, vector)
     box_factor(0, 1, boxes[0], K, 1.0).linearize(values)
     initialise(np.stack([pose.matrix() for pose in poses]), boxes, K, 1.0, InitialisationSettings())
+    overlaps_at(
+        poses[0].matrix(), vector[None, :3], np.eye(3)[None], K, bounds[2:], bounds[None], np.ones((1, 1), bool)
+    )
     localise(poses[0].matrix(), np.eye(6), [values.atVector(1)], boxes[:1], K, 1.0, 1.0)

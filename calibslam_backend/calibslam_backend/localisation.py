@@ -18,6 +18,9 @@ from calibslam_msgs_py.measurements import Array
 # The second start believes odometry this much less: its standard deviations times ten.
 DISTRUST = 10.0
 ITERATIONS = 15
+NEVER_DOUBTED = 1e6
+# A prior of one radian and two metres: hardly any.
+FREE = np.diag([1.0, 1.0, 1.0, 0.5, 0.5, 0.5])
 
 
 def localise(
@@ -42,30 +45,52 @@ def localise(
     if not boxes:
         return predicted
     whitener = np.linalg.inv(np.linalg.cholesky(covariance))
-    measured = [np.stack([getattr(b, n) for b in boxes]) for n in ("corners", "whitener", "bounds", "clip")]
-    vectors = np.stack(quadrics)
+    seen = _Seen(np.stack(quadrics), boxes, K, robust_scale)
     first = gtsam.Pose3(predicted)
-
-    def minimise(pose: gtsam.Pose3, W: Array, k: float) -> tuple[float, gtsam.Pose3]:
-        damping, best, cost, A, b = 1e-3, pose, np.inf, np.eye(6), np.zeros(6)
-        for _ in range(ITERATIONS):
-            e = W @ gtsam.Pose3.Logmap(first.between(pose))
-            rho, weight = robust_loss(e @ e, k)
-            H, g = weight * W.T @ W, -weight * W.T @ e
-            c = rho + _boxes(pose.matrix(), vectors, K, *measured, robust_scale, H, g)
-            if c <= cost:
-                done = cost - c < 1e-3 * c
-                best, cost, A, b, damping = pose, c, H, g, max(damping / 10.0, 1e-6)
-                if done:
-                    break
-            else:
-                damping *= 10.0
-            pose = best.retract(np.linalg.solve(A + damping * np.diag(np.diag(A)), b))
-        return cost, best
-
-    _, guess = minimise(first, whitener / DISTRUST, 1e6)
-    results = [minimise(start, whitener, robust_odometry) for start in (first, guess)]
+    _, guess = _minimise(first, first, whitener / DISTRUST, NEVER_DOUBTED, seen)
+    results = [_minimise(start, first, whitener, robust_odometry, seen) for start in (first, guess)]
     return np.asarray(min(results, key=lambda result: result[0])[1].matrix())
+
+
+def fit(start: Array, quadrics: list[Array], boxes: list[BoxMeasurement], K: Array, robust_scale: float) -> Array:
+    """Pose (4, 4) of the camera from boxes alone, near `start` (4, 4); arguments as in `localise`."""
+    first = gtsam.Pose3(start)
+    seen = _Seen(np.stack(quadrics), boxes, K, robust_scale)
+    return np.asarray(_minimise(first, first, FREE, NEVER_DOUBTED, seen)[1].matrix())
+
+
+class _Seen:
+    """Quadrics and their boxes as arrays."""
+
+    def __init__(self, vectors: Array, boxes: list[BoxMeasurement], K: Array, robust_scale: float) -> None:
+        self._measured = [np.stack([getattr(b, n) for b in boxes]) for n in ("corners", "whitener", "bounds", "clip")]
+        self._vectors, self._K, self._robust_scale = vectors, K, robust_scale
+
+    def add(self, pose: gtsam.Pose3, H: Array, g: Array) -> float:
+        """Robust cost of the boxes at a pose; adds their normal equations to H (6, 6) and g (6,)."""
+        cost: float = _boxes(pose.matrix(), self._vectors, self._K, *self._measured, self._robust_scale, H, g)
+        return cost
+
+
+def _minimise(
+    start: gtsam.Pose3, predicted: gtsam.Pose3, whitener: Array, k: float, seen: _Seen
+) -> tuple[float, gtsam.Pose3]:
+    """Levenberg-Marquardt; returns cost and pose."""
+    pose, best, damping, cost, A, b = start, start, 1e-3, np.inf, np.eye(6), np.zeros(6)
+    for _ in range(ITERATIONS):
+        e = whitener @ gtsam.Pose3.Logmap(predicted.between(pose))
+        rho, weight = robust_loss(e @ e, k)
+        H, g = weight * whitener.T @ whitener, -weight * whitener.T @ e
+        c = rho + seen.add(pose, H, g)
+        if c <= cost:
+            done = cost - c < 1e-3 * c
+            best, cost, A, b, damping = pose, c, H, g, max(damping / 10.0, 1e-6)
+            if done:
+                break
+        else:
+            damping *= 10.0
+        pose = best.retract(np.linalg.solve(A + damping * np.diag(np.diag(A)), b))
+    return cost, best
 
 
 @numba.njit(cache=True)

@@ -1,0 +1,203 @@
+"""Where the camera is, from nothing but which objects it sees: after a loop, a lost odometry, in a known map.
+
+A box and a quadric of its class give the quadric's place in the camera: the ray through the box, at the distance
+where the object has the size of the box. One such pair and the rotation of odometry, or three pairs without it, give a
+pose; the pose that explains most boxes is refined and counts if it explains several, and more than the pose that
+odometry predicts.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import combinations
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from calibslam_backend.box_measurement import BoxMeasurement
+from calibslam_backend.localisation import fit
+from calibslam_backend.quadric import matrix_from_vector
+from calibslam_msgs_py.measurements import Array
+from calibslam_msgs_py.settings import Settings, setting
+
+
+@dataclass(frozen=True)
+class RelocalisationSettings(Settings):
+    relocalisation_boxes: int = setting(4, "boxes a new pose must explain", low=3)
+    relocalisation_gain: int = setting(2, "boxes it must explain more than odometry's pose", low=1)
+    relocalisation_overlap: float = setting(
+        0.35, "intersection over union of a box that is explained", low=0.05, high=0.95
+    )
+
+
+@dataclass(frozen=True)
+class Relocalised:
+    """A pose T_map_camera (4, 4) and the pairs (box, quadric), by index, that it explains."""
+
+    T_map_camera: Array
+    pairs: list[tuple[int, int]]
+
+
+REFINED = 4  # best hypotheses that are refined
+TRIPLES = 300  # hypotheses of three pairs at most
+LENGTH_ERROR = 0.3  # by which distances between objects, guessed from their sizes, may be wrong
+PROMISING = 3  # pairs that a hypothesis must explain to be refined
+
+
+def relocalise(
+    predicted: Array,
+    boxes: Sequence[BoxMeasurement],
+    quadrics: Array,
+    compatible: NDArray[np.bool_],
+    K: Array,
+    image: tuple[int, int],
+    robust_scale: float,
+    settings: RelocalisationSettings,
+) -> Relocalised | None:
+    """A better pose than the predicted one, or None.
+
+    Args:
+        predicted: (4, 4) T_map_camera by odometry.
+        boxes: N of one image.
+        quadrics: (M, 9) vectors.
+        compatible: (N, M) whether a box may be of a quadric, by their classes.
+        K: (3, 3) camera matrix [px].
+        image: width and height [px].
+        robust_scale: as in the factor graph.
+        settings: what a pose must explain.
+    """
+    if len(boxes) < settings.relocalisation_boxes or np.count_nonzero(compatible) < settings.relocalisation_boxes:
+        return None
+    corners = np.stack([box.corners for box in boxes])
+    shapes, sizes = _shapes(quadrics)
+    size = np.array(image, dtype=np.float64)
+
+    def explained(T: Array) -> list[tuple[int, int]]:
+        overlaps = overlaps_at(T, quadrics[:, :3], shapes, K, size, corners, compatible)
+        return _one_to_one(overlaps, settings.relocalisation_overlap)
+
+    def score(T: Array) -> float:
+        return float(overlaps_at(T, quadrics[:, :3], shapes, K, size, corners, compatible).max(axis=1).sum())
+
+    needed = max(settings.relocalisation_boxes, len(explained(predicted)) + settings.relocalisation_gain)
+    points = _points(corners, sizes, K)
+    best: Relocalised | None = None
+    for hypotheses in (_by_one(predicted, points, quadrics, compatible), _by_three(points, quadrics, compatible)):
+        for T in sorted(hypotheses, key=score, reverse=True)[:REFINED]:
+            pairs = explained(T)
+            for _ in range(2):  # better poses explain more boxes, which make better poses
+                if len(pairs) < PROMISING:
+                    break
+                T = fit(T, [quadrics[j] for _, j in pairs], [boxes[i] for i, _ in pairs], K, robust_scale)
+                pairs = explained(T)
+            if len(pairs) >= needed and (best is None or len(pairs) > len(best.pairs)):
+                best = Relocalised(T, pairs)
+        if best is not None:
+            return best
+    return None
+
+
+def _shapes(quadrics: Array) -> tuple[Array, Array]:
+    """S (M, 3, 3) [m^2] and mean radius (M,) [m] of each quadric."""
+    shapes, sizes = np.empty((len(quadrics), 3, 3)), np.empty(len(quadrics))
+    for n, vector in enumerate(quadrics):
+        logarithms, axes = np.linalg.eigh(matrix_from_vector(vector[3:]))
+        shapes[n] = (axes * np.exp(2.0 * logarithms)) @ axes.T
+        sizes[n] = np.exp(logarithms.mean())
+    return shapes, sizes
+
+
+def _points(corners: Array, sizes: Array, K: Array) -> Array:
+    """(N, M, 3) centre of quadric m in the camera, if box n is of it."""
+    extent = np.sqrt((corners[:, 2] - corners[:, 0]) * (corners[:, 3] - corners[:, 1]))
+    depths = np.sqrt(K[0, 0] * K[1, 1]) * 2.0 * sizes[None, :] / extent[:, None]
+    centres = np.stack([corners[:, 0] + corners[:, 2], corners[:, 1] + corners[:, 3]], axis=1) / 2.0
+    rays = np.concatenate([centres, np.ones((len(centres), 1))], axis=1) @ np.linalg.inv(K).T
+    return np.asarray(depths[:, :, None] * rays[:, None, :])
+
+
+def _by_one(predicted: Array, points: Array, quadrics: Array, compatible: NDArray[np.bool_]) -> list[Array]:
+    """Poses with the predicted rotation, one per compatible pair."""
+    poses = []
+    for n, m in np.argwhere(compatible):
+        T = predicted.copy()
+        T[:3, 3] = quadrics[m, :3] - T[:3, :3] @ points[n, m]
+        poses.append(T)
+    return poses
+
+
+def _by_three(points: Array, quadrics: Array, compatible: NDArray[np.bool_]) -> list[Array]:
+    """Poses from three pairs whose distances agree. Sampled with a fixed seed: the same input gives the same poses."""
+    pairs = np.argwhere(compatible)
+    if len(pairs) < 3:
+        return []
+    if len(pairs) <= 20:
+        triples = pairs[np.array(list(combinations(range(len(pairs)), 3)))]
+    else:
+        triples = pairs[np.random.default_rng(0).integers(len(pairs), size=(20 * TRIPLES, 3))]
+    n, m = triples[:, :, 0], triples[:, :, 1]
+    different = [(ids != np.roll(ids, 1, axis=1)).all(axis=1) for ids in (n, m)]
+    here, there = points[n, m], quadrics[m, :3]
+    lengths = [np.linalg.norm(p - np.roll(p, 1, axis=1), axis=2) for p in (here, there)]
+    agree = (np.abs(lengths[0] - lengths[1]) <= LENGTH_ERROR * lengths[1]).all(axis=1)
+    chosen = np.flatnonzero(different[0] & different[1] & agree)[:TRIPLES]
+    return [_rigid(here[i], there[i]) for i in chosen]
+
+
+def _rigid(here: Array, there: Array) -> Array:
+    """(4, 4) T with there = T here, least squares (Umeyama 1991, without scale)."""
+    a, b = here.mean(axis=0), there.mean(axis=0)
+    U, _, Vt = np.linalg.svd((there - b).T @ (here - a))
+    T = np.eye(4)
+    T[:3, :3] = U @ np.diag([1.0, 1.0, np.sign(np.linalg.det(U @ Vt))]) @ Vt
+    T[:3, 3] = b - T[:3, :3] @ a
+    return T
+
+
+def _one_to_one(overlaps: Array, least: float) -> list[tuple[int, int]]:
+    """Pairs (row, column) of at least this overlap, best first, each row and column once."""
+    remaining = overlaps.copy()
+    pairs = []
+    while remaining.size and remaining.max() >= least:
+        n, m = np.unravel_index(int(remaining.argmax()), remaining.shape)
+        pairs.append((int(n), int(m)))
+        remaining[n, :] = 0.0
+        remaining[:, m] = 0.0
+    return pairs
+
+
+@numba.njit(cache=True)
+def overlaps_at(T, centres, shapes, K, size, corners, compatible):  # type: ignore[no-untyped-def]
+    """Intersection over union (N, M) of boxes (N, 4) with those that M quadrics have in the image, seen from T (4, 4).
+
+    Zero for pairs that are not compatible (N, M).
+    """
+    result = np.zeros((len(corners), len(centres)))
+    R = np.ascontiguousarray(T[:3, :3])
+    for m in range(len(centres)):
+        c = R.T @ (centres[m] - T[:3, 3])
+        if c[2] <= 0.0:
+            continue
+        N = R.T @ shapes[m] @ R - np.outer(c, c)
+        if N[2, 2] >= 0.0:
+            continue
+        x, y = N[0, 2] / N[2, 2], N[1, 2] / N[2, 2]
+        dx = np.sqrt(max(x * x - N[0, 0] / N[2, 2], 0.0)) * K[0, 0]
+        dy = np.sqrt(max(y * y - N[1, 1] / N[2, 2], 0.0)) * K[1, 1]
+        x, y = x * K[0, 0] + K[0, 2], y * K[1, 1] + K[1, 2]
+        left, right = max(x - dx, 0.0), min(x + dx, size[0])
+        top, bottom = max(y - dy, 0.0), min(y + dy, size[1])
+        if left >= right or top >= bottom:
+            continue
+        for n in range(len(corners)):
+            if not compatible[n, m]:
+                continue
+            width = min(right, corners[n, 2]) - max(left, corners[n, 0])
+            height = min(bottom, corners[n, 3]) - max(top, corners[n, 1])
+            if width > 0.0 and height > 0.0:
+                shared = width * height
+                own = (corners[n, 2] - corners[n, 0]) * (corners[n, 3] - corners[n, 1])
+                result[n, m] = shared / (own + (right - left) * (bottom - top) - shared)
+    return result
