@@ -24,6 +24,7 @@ from sensor_msgs.msg import CameraInfo
 from std_srvs.srv import SetBool, Trigger
 
 from calibslam_backend.estimator import Estimator, EstimatorSettings
+from calibslam_backend.kernels import load_kernels
 from calibslam_backend.map_to_odom_node import MapToOdom
 from calibslam_backend.object_map import MapFileError, ObjectMap
 from calibslam_backend.published import MAP, POSE, TOPICS, map_messages, pose_message
@@ -36,7 +37,7 @@ from calibslam_msgs_py.conversions import (
     valid_boxes,
 )
 from calibslam_msgs_py.measurements import Boxes, Camera, InvalidMeasurement, RelativeMotion
-from calibslam_msgs_py.node import LATCHED, MEASUREMENT, SENSOR, Counters, run
+from calibslam_msgs_py.node import LATCHED, MEASUREMENT_INPUT, SENSOR, Counters, run
 from calibslam_msgs_py.settings import Settings, SettingsError, declare_parameters, setting
 
 SECONDS_BETWEEN_WARNINGS = 5.0
@@ -70,6 +71,7 @@ class BackendNode(Node):
             topic: self.create_publisher(self._types(kind), topic, LATCHED) for topic, kind in TOPICS.items()
         }
         self._map_to_odom = MapToOdom(self, MAP)
+        load_kernels()  # before anything can come in and wait
         self._estimator: Estimator | None = None
         self._camera: Camera | None = None
         self._paused = False
@@ -80,8 +82,8 @@ class BackendNode(Node):
         self._worker = threading.Thread(target=self._work, name="estimator", daemon=True)
         self._worker.start()
         self.create_subscription(CameraInfo, "camera/camera_info", self._receive_camera, SENSOR)
-        self.create_subscription(RelativePose, "relative_pose", self._receive_motion, MEASUREMENT)
-        self.create_subscription(BoundingBoxArray, "detections", self._receive_boxes, MEASUREMENT)
+        self.create_subscription(RelativePose, "relative_pose", self._receive_motion, MEASUREMENT_INPUT)
+        self.create_subscription(BoundingBoxArray, "detections", self._receive_boxes, MEASUREMENT_INPUT)
         self.create_service(Trigger, "~/reset", self._reset)
         self.create_service(SetBool, "~/pause", self._pause)
         self.create_service(SaveMap, "~/save_map", self._save)
@@ -151,16 +153,23 @@ class BackendNode(Node):
         return response
 
     def _save(self, request: Any, response: Any) -> Any:
+        """Uses what has come in, refines, and writes: the best map there is now."""
         path = Path(request.path)
         with self._lock:
-            if self._estimator is None or not self._estimator.stamps:
-                response.success, response.message = False, "nothing to save: there is no keyframe yet"
-                return response
             try:
+                while self._estimator is not None and not self._queue.empty():
+                    self._use(self._queue.get_nowait())
+                if self._estimator is None or not self._estimator.stamps:
+                    response.success, response.message = False, "nothing to save: there is no keyframe yet"
+                    return response
+                self._estimator.finish()
                 path.parent.mkdir(parents=True, exist_ok=True)
                 self._estimator.object_map().save(path)
             except OSError as error:
                 response.success, response.message = False, f"cannot write {path}: {error.strerror or error}"
+                return response
+            except RuntimeError as error:
+                response.success, response.message = False, f"the estimate cannot be used: {error}"
                 return response
             response.success = True
             response.message = (

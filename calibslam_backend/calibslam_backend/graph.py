@@ -70,7 +70,8 @@ class ObjectGraph:
     # A quadric beyond these is no object any more [m].
     LARGEST_RADIUS, LARGEST_DISTANCE, SMALLEST_RADIUS = 10.0, 200.0, 1e-4
     LARGEST_STEP = 0.5  # [rad, m] of a pose in one update; more is checked by a damped optimisation
-    BATCH_ITERATIONS = 100
+    BATCH_ITERATIONS, REPAIR_ITERATIONS = 100, 15
+    CONVERGED = 1e-4  # share by which an iteration has to lower the error
 
     def __init__(self, K: Array, settings: GraphSettings, priors: InitialisationSettings) -> None:
         self._K = np.ascontiguousarray(K, float)
@@ -203,7 +204,7 @@ class ObjectGraph:
 
     def optimise(self) -> None:
         """The batch optimum by Levenberg-Marquardt, from which the tree is built anew."""
-        self._rebuild(self._levenberg_marquardt(self._values))
+        self._rebuild(self._levenberg_marquardt(self._values, self.BATCH_ITERATIONS))
 
     def _step(self, everything: bool) -> None:
         changes = gtsam.ISAM2UpdateParams()
@@ -263,7 +264,7 @@ class ObjectGraph:
         """
         while True:
             try:
-                self._rebuild(self._levenberg_marquardt(before))
+                self._rebuild(self._levenberg_marquardt(before, self.REPAIR_ITERATIONS))
                 return
             except RuntimeError as error:
                 if not self.landmarks:
@@ -273,12 +274,17 @@ class ObjectGraph:
                 del self.landmarks[youngest]
                 before.erase(symbol("q", youngest))
 
-    def _levenberg_marquardt(self, values: gtsam.Values) -> gtsam.Values:
+    def _levenberg_marquardt(self, values: gtsam.Values, iterations: int) -> gtsam.Values:
         self._begin_change()
         self._add_all_factors()
-        parameters = gtsam.LevenbergMarquardtParams()
-        parameters.setMaxIterations(self.BATCH_ITERATIONS)
-        return gtsam.LevenbergMarquardtOptimizer(self._new_factors, values, parameters).optimize()
+        optimiser = gtsam.LevenbergMarquardtOptimizer(self._new_factors, values, gtsam.LevenbergMarquardtParams())
+        error = optimiser.error()
+        for _ in range(iterations):  # one at a time, so that other threads of the process are served in between
+            optimiser.iterate()
+            if error - optimiser.error() < self.CONVERGED * error:
+                break
+            error = optimiser.error()
+        return optimiser.values()
 
     def _rebuild(self, values: gtsam.Values) -> None:
         """A new tree of all factors, linearised at these values."""

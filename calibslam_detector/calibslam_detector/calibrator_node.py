@@ -17,7 +17,7 @@ from rclpy.node import Node
 from calibslam_detector.calibrator import CalibratorError, load
 from calibslam_msgs_py.conversions import RosTypes, boxes_from_msg, boxes_to_msg, valid_boxes
 from calibslam_msgs_py.measurements import InvalidMeasurement
-from calibslam_msgs_py.node import MEASUREMENT, Counters, run
+from calibslam_msgs_py.node import MEASUREMENT, MEASUREMENT_INPUT, Counters, run
 from calibslam_msgs_py.settings import Settings, SettingsError, declare_parameters, setting
 
 SECONDS_BETWEEN_WARNINGS = 5.0
@@ -43,7 +43,7 @@ class CalibratorNode(Node):
         self._types = RosTypes()
         self._counters = Counters(self)
         self._publisher = self.create_publisher(BoundingBoxArray, "detections", MEASUREMENT)
-        self.create_subscription(BoundingBoxArray, "detections_raw", self._receive, MEASUREMENT)
+        self.create_subscription(BoundingBoxArray, "detections_raw", self._receive, MEASUREMENT_INPUT)
 
     def _receive(self, message: Any) -> None:
         try:

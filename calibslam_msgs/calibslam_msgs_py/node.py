@@ -22,6 +22,10 @@ from calibslam_msgs_py.settings import SettingsError
 SENSOR: QoSProfile = qos_profile_sensor_data
 # Boxes and motions: none may get lost.
 MEASUREMENT = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=100, reliability=ReliabilityPolicy.RELIABLE)
+# Who takes them in has room for several seconds of them, for a moment when it is busy.
+MEASUREMENT_INPUT = QoSProfile(
+    history=HistoryPolicy.KEEP_LAST, depth=5000, reliability=ReliabilityPolicy.RELIABLE
+)
 # Maps: the last one also for who joins late.
 LATCHED = QoSProfile(
     history=HistoryPolicy.KEEP_LAST,

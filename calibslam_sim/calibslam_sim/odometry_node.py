@@ -25,7 +25,7 @@ from calibslam_msgs_py.conversions import (
     stamped_pose_from_msg,
 )
 from calibslam_msgs_py.measurements import InvalidMeasurement, RelativeMotion
-from calibslam_msgs_py.node import MEASUREMENT, Counters, run
+from calibslam_msgs_py.node import MEASUREMENT, MEASUREMENT_INPUT, Counters, run
 from calibslam_msgs_py.settings import Settings, SettingsError, declare_parameters, setting
 from calibslam_sim.odometry_noise import OdometryNoise, add_noise
 from calibslam_sim.random_streams import stream
@@ -69,9 +69,9 @@ class OdometryNode(Node):
         self._counters = Counters(self)
         self._publisher = self.create_publisher(RelativePose, "relative_pose", MEASUREMENT)
         if settings.source == "odom":
-            self.create_subscription(Odometry, "odom", self._receive_odometry, MEASUREMENT)
+            self.create_subscription(Odometry, "odom", self._receive_odometry, MEASUREMENT_INPUT)
         else:
-            self.create_subscription(PoseStamped, "ground_truth", self._receive_truth, MEASUREMENT)
+            self.create_subscription(PoseStamped, "ground_truth", self._receive_truth, MEASUREMENT_INPUT)
 
     def _receive_odometry(self, message: Any) -> None:
         try:
