@@ -6,8 +6,9 @@ log-likelihood of a heavy-tailed (multivariate Cauchy-like) distribution, rho(q)
 q for a good box and grows ever more slowly for a bad one. The four edges of a box share one q: gross errors concern
 the whole box.
 
-The factor's error is e = r sqrt(rho / q), so that |e|^2 = rho, and its Jacobian is the exact derivative of that:
-batch and incremental optimisers, and numerical derivatives, all see one and the same function.
+GTSAM's robust noise model weighs the residual of the whole box so, by its norm. The optimisers see J and r times the
+square root of the weight (iteratively reweighted least squares), never a derivative of sqrt(rho): for a doubtful box
+that is far too flat, and Gauss-Newton steps without a line search, such as those of ISAM2, overshoot.
 """
 
 from __future__ import annotations
@@ -40,29 +41,6 @@ def robust_loss(q, k):  # type: ignore[no-untyped-def]
     return k * k * np.log1p(q / (k * k)), 1.0 / (1.0 + q / (k * k))
 
 
-@numba.njit(cache=True)
-def robust_residual(T_map_camera, quadric, K, corners, whitener, bounds, clip, k, jacobian):  # type: ignore[no-untyped-def]
-    """The factor's error (4,); writes its derivative to `jacobian` (4, 15), columns as in `quadric`."""
-    visible, r, dr = whitened_residual(T_map_camera, quadric, K, corners, whitener, bounds, clip)
-    if not visible:
-        jacobian[:] = 0.0
-        rho, _ = robust_loss(INVISIBLE**2, k)
-        r[:] = 0.5 * np.sqrt(rho)
-        return r
-    q = r @ r
-    if q < 1e-8:  # e = r (1 - q / 4k^2 ...)
-        jacobian[:] = dr
-        return r
-    rho, weight = robust_loss(q, k)
-    scale = np.sqrt(rho / q)
-    d_scale = (weight * q - rho) / (2.0 * scale * q * q)
-    for column in range(DIMENSION):
-        d_q = 2.0 * (r[0] * dr[0, column] + r[1] * dr[1, column] + r[2] * dr[2, column] + r[3] * dr[3, column])
-        for row in range(4):
-            jacobian[row, column] = scale * dr[row, column] + d_scale * d_q * r[row]
-    return scale * r
-
-
 _UNIT = gtsam.noiseModel.Unit.Create(4)
 
 
@@ -77,23 +55,16 @@ def box_factor(pose: int, quadric: int, box: BoxMeasurement, K: Array, robust_sc
         robust_scale: k, the Mahalanobis distance from which a box counts as doubtful.
     """
     corners, whitener, bounds, clip = (np.ascontiguousarray(a) for a in vars(box).values())
-    jacobian = np.empty((4, DIMENSION))
+    noise = gtsam.noiseModel.Robust.Create(gtsam.noiseModel.mEstimator.Cauchy.Create(robust_scale), _UNIT)
 
     def error(_: gtsam.CustomFactor, values: gtsam.Values, H: list[Array] | None) -> Array:
-        e: Array = robust_residual(
-            values.atPose3(pose).matrix(),
-            values.atVector(quadric),
-            K,
-            corners,
-            whitener,
-            bounds,
-            clip,
-            robust_scale,
-            jacobian,
-        )
+        T, vector = values.atPose3(pose).matrix(), values.atVector(quadric)
+        visible, r, J = whitened_residual(T, vector, K, corners, whitener, bounds, clip)
+        if not visible:
+            r, J = np.full(4, 0.5 * INVISIBLE), np.zeros((4, DIMENSION))
         if H is not None:
-            H[0], H[1] = jacobian[:, POSE], jacobian[:, QUADRIC]
-        return e
+            H[0], H[1] = J[:, POSE], J[:, QUADRIC]
+        return np.asarray(r)
 
     handler: Callable[[gtsam.CustomFactor, gtsam.Values, list[Array] | None], Array] = error
-    return gtsam.CustomFactor(_UNIT, [pose, quadric], handler)
+    return gtsam.CustomFactor(noise, [pose, quadric], handler)
