@@ -62,10 +62,10 @@ class SmallWorld:
 
     poses: Array
     objects: list[Ellipsoid]
-    rate: float = 10.0
+    rate: float = 30.0
     box_sigma: float = 1.5
-    rotation_sigma: float = 0.003
-    translation_sigma: float = 0.004
+    rotation_sigma: float = 0.002
+    translation_sigma: float = 0.003
     seed: int = 0
     identities: bool = True
 
