@@ -35,6 +35,8 @@ class NoGroundTruth(ValueError):
 
 
 def _matched(estimate: Trajectory, truth: Trajectory) -> tuple[PoseTrajectory3D, PoseTrajectory3D]:
+    if not len(estimate.stamps):
+        raise NoGroundTruth("there is no keyframe")
     try:
         reference, matched = sync.associate_trajectories(truth.evo(), estimate.evo(), max_diff=MAX_STAMP_DIFFERENCE)
     except sync.SyncException as error:
