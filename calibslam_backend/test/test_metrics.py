@@ -89,6 +89,8 @@ def test_keyframes_are_matched_within_20_ms() -> None:
     assert ate(shifted, truth) == pytest.approx(0.0, abs=1e-9)
     with pytest.raises(NoGroundTruth, match="no ground truth within"):
         ate(Trajectory(truth.stamps + 21_000_000, truth.poses), truth)
+    with pytest.raises(NoGroundTruth, match="there is no keyframe"):
+        ate(Trajectory(truth.stamps[:0], truth.poses[:0]), truth)
     with pytest.raises(NoGroundTruth, match="only 2 keyframes"):
         rpe(Trajectory(truth.stamps[:2], truth.poses[:2]), truth)
 
