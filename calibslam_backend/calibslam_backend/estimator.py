@@ -137,6 +137,7 @@ class Estimator:
         self._next_quadric = 0
         self._waiting: list[tuple[int, int, Boxes]] = []
         self._last_frame: int | None = None
+        self._same: list[tuple[int, int]] = []  # quadrics found to be others; united after the update
         self.associations: list[tuple[int, str]] = []  # track and true identity of each box of a keyframe
 
     # -- measurements in ----------------------------------------------------------------------------------------
@@ -481,7 +482,7 @@ class Estimator:
             if bound is None:
                 self._vote_for(tracks[n], known[m])
             elif bound != known[m] and self._votes.add(~bound, known[m]) == known[m]:
-                self._unite(bound, known[m])
+                self._same.append((bound, known[m]))
 
     def _class_of(self, track: int) -> str:
         """The class most boxes of a track, or of the quadric it is bound to, carry."""
@@ -562,6 +563,11 @@ class Estimator:
         if self.settings.association == GIVEN:
             return []
         gone = []
+        for j, target in self._same:
+            if j in self._graph.landmarks and target in self._graph.landmarks:
+                self._unite(j, target)
+                gone.append(j)
+        self._same.clear()
         for j in sorted(self._graph.landmarks, reverse=True):
             ellipsoid = Ellipsoid.from_vector(self._graph.quadric(j))
             boxes = list(self._graph.landmarks[j].boxes)

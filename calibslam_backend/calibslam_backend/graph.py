@@ -173,10 +173,14 @@ class ObjectGraph:
         self._add_box_factor(k, j, box)
 
     def remove_quadric(self, j: int) -> None:
-        """Take a quadric out, with all that was measured of it."""
+        """Take a quadric out, with all that was measured of it.
+
+        Raises:
+            ValueError: something of it waits for the update.
+        """
+        if j in self._owners:
+            raise ValueError(f"quadric {j} has factors that wait for the update")
         landmark = self.landmarks.pop(j)
-        if self._new_values.exists(symbol("q", j)):
-            raise ValueError(f"quadric {j} was added in the same update")
         self._to_remove += landmark.factors
         self._values.erase(symbol("q", j))
 
