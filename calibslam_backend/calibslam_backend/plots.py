@@ -16,6 +16,7 @@ from matplotlib import pyplot as plt
 from matplotlib.axes import Axes
 from matplotlib.patches import Ellipse
 
+MARGIN = 1.5  # [m] around the trajectories
 CONFIDENCE = 2.0  # standard deviations that ellipses and bands show
 
 
@@ -49,6 +50,10 @@ def plot_run(path: Path, title: str, result: ObjectMap, odometry: Array, truth: 
     top.plot(*result.poses[0, :2, 3], "o", color="tab:green", label="start")
     top.set(xlabel="x forward [m]", ylabel="y left [m]", title=f"{title}: seen from above", aspect="equal")
     top.set_aspect("equal", adjustable="datalim")
+    # An object whose place is hardly known must not shrink everything else to a dot.
+    everything = np.concatenate([odometry[:, :2, 3], result.poses[:, :2, 3]])
+    low, high = everything.min(axis=0) - MARGIN, everything.max(axis=0) + MARGIN
+    top.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
     top.legend(loc="best", fontsize=9)
     top.grid(alpha=0.3)
     if truth is not None:
@@ -69,7 +74,9 @@ def _objects(axes: Axes, result: ObjectMap) -> None:
         if np.isfinite(quadric.covariance).all():
             sigma = (R @ quadric.covariance[3:6, 3:6] @ R.T)[:2, :2] * CONFIDENCE**2
             axes.add_patch(_ellipse(centre, sigma, fill=False, edgecolor="black", linewidth=0.8, linestyle="--"))
-        axes.annotate(quadric.class_id, (centre[0], centre[1]), fontsize=7, ha="center", va="center")
+        axes.annotate(
+            quadric.class_id, (centre[0], centre[1]), fontsize=7, ha="center", va="center", annotation_clip=True
+        )
 
 
 def _ellipse(centre: Array, shape: Array, **style: object) -> Ellipse:
