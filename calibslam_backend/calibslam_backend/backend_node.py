@@ -143,6 +143,7 @@ class BackendNode(Node):
                 self._queue.get_nowait()
             if self._estimator is not None:
                 self._estimator.reset()
+                self._reported.clear()  # the estimator counts from zero again
         response.success, response.message = True, "map and trajectory are empty"
         return response
 
@@ -188,6 +189,7 @@ class BackendNode(Node):
             try:
                 known = ObjectMap.load(Path(request.path))
                 self._estimator.load(known)
+                self._reported.clear()
             except (MapFileError, ValueError) as error:
                 response.success, response.message = False, str(error)
                 return response
