@@ -1,0 +1,178 @@
+"""The back end's node among bad input and service calls: what is wrong is counted, and it goes on."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from calibslam_msgs.msg import BoundingBoxArray, RelativePose
+from calibslam_msgs.srv import LoadMap, SaveMap
+from live import Process, Watcher, random_domain, trajectory_of, wait_until
+from nav_msgs.msg import Path as PathMessage
+from sensor_msgs.msg import CameraInfo
+from small_world import CAMERA, SmallWorld, around, objects
+from std_srvs.srv import SetBool, Trigger
+
+from calibslam_backend.metrics import ate
+from calibslam_msgs_py.conversions import RosTypes, boxes_to_msg, camera_to_msg, motion_to_msg
+from calibslam_msgs_py.measurements import Boxes, RelativeMotion
+from calibslam_msgs_py.node import LATCHED, MEASUREMENT
+
+WORLD = SmallWorld(around(150), objects())
+TYPES = RosTypes()
+PACE = 0.004  # [s] between messages: faster than any camera, slow enough for a queue of 100
+
+
+class Robot:
+    """Publishes measurements to one back end, and sees what it reports."""
+
+    def __init__(self, watcher: Watcher) -> None:
+        self.watcher = watcher
+        self._camera = watcher.node.create_publisher(CameraInfo, "camera/camera_info", LATCHED)
+        self._boxes = watcher.node.create_publisher(BoundingBoxArray, "detections", MEASUREMENT)
+        self._motions = watcher.node.create_publisher(RelativePose, "relative_pose", MEASUREMENT)
+        watcher.listen(PathMessage, "/trajectory")
+        for publisher in (self._camera, self._boxes, self._motions):
+            wait_until(lambda p=publisher: p.get_subscription_count() == 1, "the back end does not subscribe")
+
+    def camera(self) -> None:
+        self._camera.publish(camera_to_msg(CAMERA, 0, TYPES))
+
+    def boxes(self, boxes: Boxes, spoil: Callable[[Any], None] | None = None) -> None:
+        message = boxes_to_msg(boxes, TYPES)
+        if spoil:
+            spoil(message)
+        self._boxes.publish(message)
+        time.sleep(PACE)
+
+    def motion(self, motion: RelativeMotion, spoil: Callable[[Any], None] | None = None) -> None:
+        message = motion_to_msg(motion, TYPES)
+        if spoil:
+            spoil(message)
+        self._motions.publish(message)
+        time.sleep(PACE)
+
+    def drive(self, start: int, end: int, world: SmallWorld = WORLD) -> None:
+        """Images from `start` to `end` - 1, and the motions to them."""
+        boxes, motions = world.boxes(), world.motions()
+        for k in range(start, end):
+            if k:
+                self.motion(motions[k - 1])
+            self.boxes(boxes[k])
+
+    def expect(self, **counts: int) -> None:
+        """Wait until the diagnostics say so."""
+        expected = {name: str(count) for name, count in counts.items()}
+        wait_until(
+            lambda: self.watcher.counts("/backend").items() >= expected.items(),
+            lambda: f"expected {expected}, reported {self.watcher.counts('/backend')}",
+        )
+
+
+@pytest.fixture
+def robot() -> Iterator[Robot]:
+    domain = random_domain()
+    with Watcher(domain) as watcher, Process(domain, "calibslam_backend", "backend") as backend:
+        yield Robot(watcher)
+        assert backend.running, backend.output
+        assert backend.end() == 0, backend.output
+        assert "Traceback" not in backend.output
+
+
+def test_bad_input_is_counted_and_the_graph_goes_on(robot: Robot) -> None:
+    boxes, motions = WORLD.boxes(), WORLD.motions()
+    robot.camera()
+    robot.drive(0, 50)
+    robot.expect(images=50, motions=49)
+
+    def nan(message: Any) -> None:
+        message.boxes[0].corners[2] = np.nan
+
+    def indefinite(message: Any) -> None:
+        for box in message.boxes[:2]:
+            box.covariance[0] = -4.0
+
+    def outside(message: Any) -> None:
+        message.boxes[0].corners[:] = [-90.0, 0.0, -10.0, 20.0]
+
+    def other_size(message: Any) -> None:
+        message.width = 1280
+
+    def infinite(message: Any) -> None:
+        message.motion.pose.position.z = np.inf
+
+    def indefinite_motion(message: Any) -> None:
+        message.motion.covariance[7] = -1.0
+
+    robot.motion(motions[49])
+    robot.boxes(boxes[50], nan)
+    robot.motion(motions[50])
+    robot.boxes(boxes[51], indefinite)
+    robot.motion(motions[51])
+    robot.boxes(boxes[52], outside)
+    robot.boxes(boxes[53], other_size)
+    robot.motion(motions[52], infinite)
+    robot.motion(motions[52], indefinite_motion)
+    robot.motion(motions[10])  # time goes backwards
+    robot.motion(replace(motions[52], start=motions[52].end + 1, end=motions[52].end + 2), reversed_time)
+    robot.boxes(boxes[20])
+    robot.boxes(boxes[52])
+    robot.expect(
+        rejected_box_nan=1, rejected_box_covariance=2, rejected_box_outside=1, rejected_image_size=1, rejected_pose=1,
+        rejected_covariance=1, rejected_overlap=1, rejected_time=1, rejected_late=1, rejected_duplicate=1, images=53,
+    )  # fmt: skip
+    robot.drive(53, 150)
+    robot.expect(images=150, motions=149)
+    wait_until(lambda: ate(trajectory_of(robot.watcher.last["/trajectory"]), WORLD.truth()) < 0.04, "a good trajectory")
+    assert "errors" not in robot.watcher.counts("/backend")
+
+
+def reversed_time(message: Any) -> None:
+    message.start, message.header.stamp = message.header.stamp, message.start
+
+
+def test_measurements_wait_for_the_camera(robot: Robot) -> None:
+    robot.drive(0, 40)
+    robot.camera()
+    robot.expect(images=40, motions=39)
+
+
+def test_pause_reset_save_and_load(robot: Robot, tmp_path: Path) -> None:
+    call = robot.watcher.call
+    path = str(tmp_path / "map.json")
+    refused = call(LoadMap, "/backend/load_map", path=path)
+    assert not refused.success and "no camera_info yet" in refused.message
+    refused = call(SaveMap, "/backend/save_map", path=path)
+    assert not refused.success and "nothing to save" in refused.message
+    robot.camera()
+    robot.drive(0, 100)
+    robot.expect(images=100, motions=99, **{"objects": 9})
+    # Into a file as if it were a folder.
+    (tmp_path / "file").touch()
+    refused = call(SaveMap, "/backend/save_map", path=str(tmp_path / "file" / "map.json"))
+    assert not refused.success and "cannot write" in refused.message
+    assert call(SaveMap, "/backend/save_map", path=path).success
+    # While paused, measurements are ignored; afterwards they count again.
+    paused = call(SetBool, "/backend/pause", data=True)
+    assert paused.success and "paused" in paused.message
+    robot.drive(100, 110)
+    robot.expect(images=100, ignored_while_paused=20)
+    assert call(SetBool, "/backend/pause", data=False).message == "running"
+    robot.drive(110, 120)
+    robot.expect(images=110, odometry_gap=1)
+    # After a reset a recording can start again, also at an earlier time.
+    assert call(Trigger, "/backend/reset").success
+    robot.drive(0, 60)
+    robot.expect(images=170)
+    refused = call(SaveMap, "/backend/save_map", path=str(tmp_path / "second.json"))
+    assert refused.success
+    # A known map: its objects are there before anything is seen.
+    loaded = call(LoadMap, "/backend/load_map", path=path)
+    assert loaded.success and "9 objects" in loaded.message
+    robot.drive(0, 60, replace(WORLD, seed=1))
+    robot.expect(images=230, objects=9)
