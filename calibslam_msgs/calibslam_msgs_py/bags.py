@@ -87,9 +87,7 @@ class BagReader:
 
     def _connections(self, topics: Collection[str]) -> list[Connection]:
         if missing := sorted(set(topics) - set(self.topics)):
-            there = "\n".join(
-                f"  {name}  ({kind}, {self.counts[name]})" for name, kind in self.topics.items()
-            )
+            there = "\n".join(f"  {name}  ({kind}, {self.counts[name]})" for name, kind in self.topics.items())
             raise BagError(f"{self.path} has no topic {', '.join(missing)}; it has:\n{there or '  none'}")
         return [connection for connection in self._reader.connections if connection.topic in topics]
 
@@ -243,12 +241,8 @@ def _remove_bag(path: Path) -> None:
         path.unlink()
         return
     foreign = (
-        [p for p in path.iterdir() if p.name != "metadata.yaml" and p.suffix != ".mcap"]
-        if path.is_dir()
-        else [path]
+        [p for p in path.iterdir() if p.name != "metadata.yaml" and p.suffix != ".mcap"] if path.is_dir() else [path]
     )
     if foreign:
-        raise BagError(
-            f"{path} is not overwritten: it is not a bag, or holds other files ({foreign[0].name})"
-        )
+        raise BagError(f"{path} is not overwritten: it is not a bag, or holds other files ({foreign[0].name})")
     shutil.rmtree(path)

@@ -27,9 +27,7 @@ def boxes_from_msg(msg: Any) -> Boxes:
     if msg.width < 1 or msg.height < 1:
         raise InvalidMeasurement("image_size", f"boxes of an image of {msg.width} x {msg.height} pixels")
     corners = [doubles_of(box.corners, 4, "corners of a box") for box in msg.boxes]
-    covariances = [
-        _box_covariance(doubles_of(box.covariance, 16, "covariance of a box")) for box in msg.boxes
-    ]
+    covariances = [_box_covariance(doubles_of(box.covariance, 16, "covariance of a box")) for box in msg.boxes]
     return Boxes(
         stamp=stamp_from_msg(msg.header.stamp),
         width=int(msg.width),
@@ -75,23 +73,7 @@ def valid_boxes(boxes: Boxes) -> tuple[Boxes, dict[str, int]]:
         if count := int((keep & defect).sum()):
             rejected[reason] = count
         keep &= ~defect
-    return (boxes if keep.all() else boxes_where(boxes, keep)), rejected
-
-
-def boxes_where(boxes: Boxes, keep: np.ndarray) -> Boxes:
-    """The boxes for which `keep` (N,) is true."""
-    rows = np.flatnonzero(keep)
-    return Boxes(
-        stamp=boxes.stamp,
-        width=boxes.width,
-        height=boxes.height,
-        corners=boxes.corners[rows],
-        covariances=boxes.covariances[rows],
-        class_ids=tuple(boxes.class_ids[i] for i in rows),
-        scores=boxes.scores[rows],
-        object_ids=tuple(boxes.object_ids[i] for i in rows),
-        frame_id=boxes.frame_id,
-    )
+    return (boxes if keep.all() else boxes.select(np.flatnonzero(keep))), rejected
 
 
 def boxes_to_msg(boxes: Boxes, types: MessageTypes) -> Any:

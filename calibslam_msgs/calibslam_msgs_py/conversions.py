@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from calibslam_msgs_py.box_conversions import boxes_from_msg, boxes_to_msg, boxes_where, valid_boxes
+from calibslam_msgs_py.box_conversions import boxes_from_msg, boxes_to_msg, valid_boxes
 from calibslam_msgs_py.covariance import (
     gtsam_from_ros_covariance,
     ros_from_gtsam_covariance,
@@ -52,7 +52,6 @@ __all__ = [
     "RosTypes",
     "boxes_from_msg",
     "boxes_to_msg",
-    "boxes_where",
     "camera_from_msg",
     "camera_to_msg",
     "gtsam_from_ros_covariance",
@@ -149,9 +148,7 @@ def odometry_to_msg(
     return types("nav_msgs/msg/Odometry")(
         header=header_to_msg(pose.stamp, frame_id, types),
         child_frame_id=child_frame_id,
-        pose=types("geometry_msgs/msg/PoseWithCovariance")(
-            pose=pose_to_msg(pose.T, types), covariance=zeros.copy()
-        ),
+        pose=types("geometry_msgs/msg/PoseWithCovariance")(pose=pose_to_msg(pose.T, types), covariance=zeros.copy()),
         twist=types("geometry_msgs/msg/TwistWithCovariance")(
             twist=twist, covariance=pose_covariance_to(velocity_covariance, np.eye(3)) if known else zeros
         ),
@@ -165,9 +162,7 @@ def camera_from_msg(msg: Any) -> Camera:
         InvalidMeasurement: `camera`, if it is not calibrated or its distortion is not plumb_bob.
     """
     K = doubles_of(msg.k, 9, "camera matrix").reshape(3, 3)
-    if not (
-        np.isfinite(K).all() and K[0, 0] > 0.0 and K[1, 1] > 0.0 and np.array_equal(K[2], [0.0, 0.0, 1.0])
-    ):
+    if not (np.isfinite(K).all() and K[0, 0] > 0.0 and K[1, 1] > 0.0 and np.array_equal(K[2], [0.0, 0.0, 1.0])):
         raise InvalidMeasurement("camera", f"the camera is not calibrated: k = {K.ravel().tolist()}")
     if msg.width < 1 or msg.height < 1:
         raise InvalidMeasurement("camera", f"a camera of {msg.width} x {msg.height} pixels")
@@ -201,9 +196,7 @@ def camera_to_msg(camera: Camera, stamp: int, types: MessageTypes) -> Any:
         p=P.ravel(),
         binning_x=0,
         binning_y=0,
-        roi=types("sensor_msgs/msg/RegionOfInterest")(
-            x_offset=0, y_offset=0, height=0, width=0, do_rectify=False
-        ),
+        roi=types("sensor_msgs/msg/RegionOfInterest")(x_offset=0, y_offset=0, height=0, width=0, do_rectify=False),
     )
 
 
@@ -254,9 +247,7 @@ def quadrics_from_msg(msg: Any) -> list[QuadricEstimate]:
     return [quadric_from_msg(quadric) for quadric in msg.quadrics]
 
 
-def quadrics_to_msg(
-    stamp: int, quadrics: Sequence[QuadricEstimate], types: MessageTypes, frame_id: str = "map"
-) -> Any:
+def quadrics_to_msg(stamp: int, quadrics: Sequence[QuadricEstimate], types: MessageTypes, frame_id: str = "map") -> Any:
     """A QuadricArray."""
     return types("calibslam_msgs/msg/QuadricArray")(
         header=header_to_msg(stamp, frame_id, types),

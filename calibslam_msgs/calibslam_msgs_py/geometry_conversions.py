@@ -137,11 +137,7 @@ def pose_covariance_from(flat: Any, R: Array, what: str) -> Array | None:
 
 def pose_covariance_to(covariance: Array | None, R: Array) -> Array:
     """(36,) in ROS' order; -1 first where unknown."""
-    return (
-        unknown_covariance(6)
-        if covariance is None
-        else symmetric(ros_from_gtsam_covariance(covariance, R)).ravel()
-    )
+    return unknown_covariance(6) if covariance is None else symmetric(ros_from_gtsam_covariance(covariance, R)).ravel()
 
 
 def stamped_pose_from_msg(msg: Any) -> StampedPose:
@@ -164,9 +160,7 @@ def path_to_msg(poses: Sequence[StampedPose], frame_id: str, types: MessageTypes
     )
 
 
-def pose_with_covariance_to_msg(
-    pose: StampedPose, covariance: Array | None, frame_id: str, types: MessageTypes
-) -> Any:
+def pose_with_covariance_to_msg(pose: StampedPose, covariance: Array | None, frame_id: str, types: MessageTypes) -> Any:
     """A geometry_msgs/PoseWithCovarianceStamped; `covariance` (6, 6) of GTSAM's tangent, None: unknown."""
     return types("geometry_msgs/msg/PoseWithCovarianceStamped")(
         header=header_to_msg(pose.stamp, frame_id, types),

@@ -7,7 +7,7 @@ frame a. A 6x6 covariance here is that of GTSAM's Pose3 tangent, [rotation, tran
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -73,6 +73,17 @@ class Boxes:
     def has_covariance(self) -> NDArray[np.bool_]:
         """(N,) whether the covariance of a box is known."""
         return ~np.isnan(self.covariances[:, 0, 0])
+
+    def select(self, indices: NDArray[np.int_]) -> Boxes:
+        """The boxes with these indices, in this order."""
+        return replace(
+            self,
+            corners=self.corners[indices],
+            covariances=self.covariances[indices],
+            class_ids=tuple(self.class_ids[i] for i in indices),
+            scores=self.scores[indices],
+            object_ids=tuple(self.object_ids[i] for i in indices),
+        )
 
 
 @dataclass(frozen=True)

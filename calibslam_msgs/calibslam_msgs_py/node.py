@@ -23,9 +23,7 @@ SENSOR: QoSProfile = qos_profile_sensor_data
 # Boxes and motions: none may get lost.
 MEASUREMENT = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=100, reliability=ReliabilityPolicy.RELIABLE)
 # Who takes them in has room for several seconds of them, for a moment when it is busy.
-MEASUREMENT_INPUT = QoSProfile(
-    history=HistoryPolicy.KEEP_LAST, depth=5000, reliability=ReliabilityPolicy.RELIABLE
-)
+MEASUREMENT_INPUT = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=5000, reliability=ReliabilityPolicy.RELIABLE)
 # Maps: the last one also for who joins late.
 LATCHED = QoSProfile(
     history=HistoryPolicy.KEEP_LAST,
@@ -61,9 +59,7 @@ def run(node_factory: Callable[[], Node], args: Sequence[str] | None = None) -> 
     node: Node | None = None
     try:
         # rclpy's own handlers shut the context down under the running executor, which then fails at times.
-        rclpy.init(
-            args=list(args) if args is not None else None, signal_handler_options=SignalHandlerOptions.NO
-        )
+        rclpy.init(args=list(args) if args is not None else None, signal_handler_options=SignalHandlerOptions.NO)
         node = node_factory()
         refuse_unknown_parameters(node)
         executor = SingleThreadedExecutor()
@@ -94,9 +90,7 @@ def refuse_unknown_parameters(node: Node) -> None:
     unknown = sorted(name for name in node._parameter_overrides if not node.has_parameter(name))
     if unknown:
         valid = sorted(name for name in node._parameters if not name.startswith("start_type_description"))
-        raise SettingsError(
-            f"{node.get_name()}: unknown parameter {', '.join(unknown)}; valid are: {', '.join(valid)}"
-        )
+        raise SettingsError(f"{node.get_name()}: unknown parameter {', '.join(unknown)}; valid are: {', '.join(valid)}")
 
 
 class Counters:

@@ -46,9 +46,7 @@ def covariance(n: int, seed: int = 0) -> np.ndarray:
 def boxes() -> Boxes:
     covariances = np.stack([covariance(4), np.full((4, 4), np.nan)])
     corners = np.array([[1.0, 2.0, 30.0, 40.0], [5.5, 6.5, 7.5, 8.5]])
-    return Boxes(
-        STAMP, 640, 480, corners, covariances, ("cup", "7"), np.array([0.9, 0.5]), ("a", ""), "camera"
-    )
+    return Boxes(STAMP, 640, 480, corners, covariances, ("cup", "7"), np.array([0.9, 0.5]), ("a", ""), "camera")
 
 
 def with_box(corners: object = None, covariance_: np.ndarray | None = None, score: float = 1.0) -> Boxes:
@@ -139,9 +137,7 @@ def test_nan_covariance_in_a_message_is_a_defect_and_not_unknown(types: c.Messag
 
 @pytest.mark.parametrize("known", [True, False])
 def test_motion_survives(types: c.MessageTypes, known: bool) -> None:
-    there = RelativeMotion(
-        STAMP - 40_000_000, STAMP, pose(1), covariance(6) * 1e-4 if known else None, "base"
-    )
+    there = RelativeMotion(STAMP - 40_000_000, STAMP, pose(1), covariance(6) * 1e-4 if known else None, "base")
     back = c.motion_from_msg(over_the_wire(c.motion_to_msg(there, types)))
     assert (back.start, back.end, back.frame_id) == (there.start, there.end, "base")
     np.testing.assert_allclose(back.T_start_end, there.T_start_end, atol=1e-12)
@@ -224,9 +220,7 @@ def test_quadrics_survive(types: c.MessageTypes, known: bool) -> None:
     if known:
         # Position and rotation are those of a pose; the radii keep their place.
         flat = np.asarray(msg.quadrics[0].covariance).reshape(9, 9)  # type: ignore[attr-defined]
-        np.testing.assert_allclose(
-            flat[:6, :6], c.ros_from_gtsam_covariance(S[:6, :6], there.T_map_object[:3, :3])
-        )
+        np.testing.assert_allclose(flat[:6, :6], c.ros_from_gtsam_covariance(S[:6, :6], there.T_map_object[:3, :3]))
         np.testing.assert_allclose(flat[6:, 6:], S[6:, 6:])
         assert is_covariance(flat)
 

@@ -21,9 +21,7 @@ def random_covariance(rng: np.random.Generator, n: int, scale: float) -> np.ndar
 def test_ros_covariance_is_that_of_sampled_poses() -> None:
     """GTSAM perturbs on the right; ROS states the error of x y z and of the rotation about fixed axes."""
     rng = np.random.default_rng(0)
-    pose = gtsam.Pose3(
-        gtsam.Rot3(Rotation.from_rotvec([0.4, -1.1, 0.8]).as_matrix()), np.array([1.0, -2.0, 3.0])
-    )
+    pose = gtsam.Pose3(gtsam.Rot3(Rotation.from_rotvec([0.4, -1.1, 0.8]).as_matrix()), np.array([1.0, -2.0, 3.0]))
     R, t = pose.rotation().matrix(), pose.translation()
     covariance = random_covariance(rng, 6, 1e-3)
 

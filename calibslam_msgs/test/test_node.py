@@ -117,9 +117,7 @@ def test_latched_topics_reach_who_joins_late(nodes: tuple[Node, Node, SingleThre
     assert [msg.data for msg in received] == ["all of it"]
 
 
-@pytest.mark.parametrize(
-    ("publisher", "subscriber"), [(MEASUREMENT, MEASUREMENT), (SENSOR, SENSOR), (10, SENSOR)]
-)
+@pytest.mark.parametrize(("publisher", "subscriber"), [(MEASUREMENT, MEASUREMENT), (SENSOR, SENSOR), (10, SENSOR)])
 def test_profiles_connect(
     nodes: tuple[Node, Node, SingleThreadedExecutor], publisher: object, subscriber: object
 ) -> None:
