@@ -8,6 +8,7 @@ keyframes agree: one coincidence costs nothing, one wrong binding costs the map.
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from dataclasses import dataclass
 
@@ -16,7 +17,7 @@ from scipy.optimize import linear_sum_assignment
 from scipy.stats import chi2
 
 from calibslam_backend.box_measurement import BoxMeasurement
-from calibslam_backend.quadric import Ellipsoid, box_of_visible_part
+from calibslam_backend.quadric import box_of_visible_part, mean_radius
 from calibslam_backend.tracking import overlap
 from calibslam_msgs_py.measurements import Array
 from calibslam_msgs_py.settings import Settings, setting
@@ -127,8 +128,8 @@ class Votes:
         self._votes.pop(track, None)
 
 
-def same_object(a: Ellipsoid, b: Ellipsoid, merge_distance: float) -> bool:
-    """Whether two ellipsoids are so close, and so alike in size, that they are one object."""
-    distance = float(np.linalg.norm(a.T_world_object[:3, 3] - b.T_world_object[:3, 3]))
-    sizes = [float(np.exp(np.log(ellipsoid.radii).mean())) for ellipsoid in (a, b)]
+def same_object(a: Array, b: Array, merge_distance: float) -> bool:
+    """Whether two quadrics, vectors (9,), are so close, and so alike in size, that they are one object."""
+    distance = math.dist(a[:3], b[:3])
+    sizes = [mean_radius(vector) for vector in (a, b)]
     return distance < merge_distance * sum(sizes) and max(sizes) < SIZE_RATIO * min(sizes)

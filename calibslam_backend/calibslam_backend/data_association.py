@@ -6,6 +6,7 @@ A track is open until it is bound to a quadric, which happens when several keyfr
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from dataclasses import dataclass, field
 
@@ -26,7 +27,6 @@ from calibslam_backend.graph import ObjectGraph, UpdateReport
 from calibslam_backend.initialisation import initialise
 from calibslam_backend.localisation import localise
 from calibslam_backend.noise import NoiseModel
-from calibslam_backend.quadric import Ellipsoid
 from calibslam_backend.relocalisation import relocalise
 from calibslam_backend.tracking import overlap
 from calibslam_msgs_py.measurements import Array, Boxes, Camera
@@ -149,7 +149,7 @@ class DataAssociation:
         near = [
             j
             for j, landmark in self._graph.landmarks.items()
-            if j not in taken and landmark.factors and self._near(T, j, [measurements[i] for i in rows])
+            if j not in taken and landmark.factors and self._in_question(T, j, [measurements[i] for i in rows])
         ]
         predictions = []
         for j, covariance in zip(near, self._graph.joint_covariances(k - 1, near), strict=True):
@@ -213,7 +213,7 @@ class DataAssociation:
             first = initialise(poses, boxes, self.camera.K, self.settings.robust_scale, self.settings)
             if first is None:
                 continue
-            known = self._known(Ellipsoid.from_vector(first.vector), candidate)
+            known = self._known(first.vector, candidate)
             if known is not None:
                 self._bind(track, known)
                 continue
@@ -224,18 +224,18 @@ class DataAssociation:
             added.append(j)
         return added
 
-    def _known(self, ellipsoid: Ellipsoid, candidate: Candidate) -> int | None:
-        """The quadric that this ellipsoid is, if the map has it."""
+    def _known(self, vector: Array, candidate: Candidate) -> int | None:
+        """The quadric that this one is, if the map has it."""
         if self.settings.association == GIVEN:
             return None
         best: int | None = None
         nearest = np.inf
         for j in self._graph.landmarks:
-            other = Ellipsoid.from_vector(self._graph.quadric(j))
-            distance = float(np.linalg.norm(other.T_world_object[:3, 3] - ellipsoid.T_world_object[:3, 3]))
+            other = self._graph.quadric(j)
+            distance = math.dist(other[:3], vector[:3])
             if (
                 distance < nearest
-                and same_object(ellipsoid, other, self.settings.merge_distance)
+                and same_object(vector, other, self.settings.merge_distance)
                 and self.classes[j].keys() & candidate.classes.keys()
                 and not self._seen_apart(candidate, j)
             ):
@@ -261,13 +261,12 @@ class DataAssociation:
 
     def _older_twin(self, j: int) -> int | None:
         """An older quadric that is the same object: of its place, size and class, and never seen beside it."""
-        ellipsoid = Ellipsoid.from_vector(self._graph.quadric(j))
-        boxes = self._graph.landmarks[j].boxes
+        vector, boxes = self._graph.quadric(j), self._graph.landmarks[j].boxes
         for i in sorted(self._graph.landmarks):
             if i >= j:
                 break
             if (
-                same_object(ellipsoid, Ellipsoid.from_vector(self._graph.quadric(i)), self.settings.merge_distance)
+                same_object(vector, self._graph.quadric(i), self.settings.merge_distance)
                 and self.class_of_quadric(i) == self.class_of_quadric(j)
                 and not _apart(boxes, self._graph.landmarks[i].boxes)
             ):
@@ -318,15 +317,11 @@ class DataAssociation:
         landmark = self._candidates[track].landmark
         return landmark is None or k - self._graph.landmarks[landmark].born <= self.YOUNG
 
-    def _near(self, T_map_camera: Array, j: int, boxes: list[BoxMeasurement]) -> bool:
-        """Whether the box a quadric predicts comes within its own size of one of these boxes."""
+    def _in_question(self, T_map_camera: Array, j: int, boxes: list[BoxMeasurement]) -> bool:
+        """Whether one of these boxes may be of a quadric: worth the cost of its joint covariance with the pose."""
         prediction = predict(T_map_camera, self._graph.quadric(j), np.zeros((15, 15)), self.camera.K, boxes[0], 0.0)
-        if prediction is None:
-            return False
-        corners = prediction[0]
-        size = np.tile(corners[2:] - corners[:2], 2)
-        grown = corners + np.array([-1.0, -1.0, 1.0, 1.0]) * size
-        return bool(overlap(grown[None], np.stack([box.corners for box in boxes])).max() > 0.0)
+        corners = np.stack([box.corners for box in boxes])
+        return prediction is not None and bool(overlap(prediction[0][None], corners).max() >= self.settings.min_overlap)
 
     def _seen_apart(self, candidate: Candidate, landmark: int) -> bool:
         """Whether an image shows both the track and the landmark, as two boxes."""

@@ -18,7 +18,7 @@ from gtsam import symbol
 from calibslam_backend.box_factor import box_factor
 from calibslam_backend.box_measurement import BoxMeasurement
 from calibslam_backend.initialisation import InitialisationSettings
-from calibslam_backend.quadric import Ellipsoid
+from calibslam_backend.quadric import matrix_from_vector
 from calibslam_msgs_py.measurements import Array
 from calibslam_msgs_py.settings import Settings, setting
 
@@ -246,7 +246,7 @@ class ObjectGraph:
         vector = self.quadric(j)
         if not np.isfinite(vector).all():
             return False
-        radii = Ellipsoid.from_vector(vector).radii
+        radii = np.exp(np.linalg.eigvalsh(matrix_from_vector(vector[3:])))
         return bool(
             radii.min() > self.SMALLEST_RADIUS
             and radii.max() < self.LARGEST_RADIUS

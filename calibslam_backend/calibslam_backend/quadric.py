@@ -18,6 +18,7 @@ An edge on the border has no derivative: it says only that the object reaches at
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numba
@@ -54,6 +55,11 @@ class Ellipsoid:
         R = self.T_world_object[:3, :3]
         L = (R * np.log(self.radii)) @ R.T
         return np.concatenate([self.T_world_object[:3, 3], vector_from_matrix(L)])
+
+
+def mean_radius(vector: Array) -> float:
+    """Geometric mean of the semi-axes of a quadric (9,) [m]: a third of the trace of L is its logarithm."""
+    return math.exp((vector[3] + vector[4] + vector[5]) / 3.0)
 
 
 def vector_from_matrix(L: Array) -> Array:

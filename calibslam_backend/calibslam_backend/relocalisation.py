@@ -82,6 +82,8 @@ def relocalise(
         return float(overlaps_at(T, quadrics[:, :3], shapes, K, size, corners, compatible).max(axis=1).sum())
 
     needed = max(settings.relocalisation_boxes, len(explained(predicted)) + settings.relocalisation_gain)
+    if len(boxes) < needed:
+        return None
     points = _points(corners, sizes, K)
     best: Relocalised | None = None
     for hypotheses in (_by_one(predicted, points, quadrics, compatible), _by_three(points, quadrics, compatible)):

@@ -10,6 +10,7 @@ from collections import Counter
 from dataclasses import dataclass, field
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
 from calibslam_backend.odometry import SECOND
@@ -50,7 +51,7 @@ def overlap(a: Array, b: Array) -> Array:
     return np.asarray(shared / (areas[0][:, None] + areas[1][None, :] - shared))
 
 
-def unique(corners: Array, scores: Array, max_overlap: float) -> Array:
+def unique(corners: Array, scores: Array, max_overlap: float) -> NDArray[np.int_]:
     """Indices of the boxes (N, 4) that remain when of each overlapping pair the one of lower score goes."""
     kept: list[int] = []
     overlaps = overlap(corners, corners)

@@ -147,10 +147,10 @@ def test_votes_by_hand() -> None:
 
 
 def test_same_objects_are_near_and_alike() -> None:
-    def at(x: float, radius: float) -> Ellipsoid:
+    def at(x: float, radius: float) -> Array:
         T = np.eye(4)
         T[0, 3] = x
-        return Ellipsoid(T, np.full(3, radius))
+        return Ellipsoid(T, np.full(3, radius)).vector()
 
     # The centres may be 0.7 of the two radii apart: 0.14 m.
     assert same_object(at(0.0, 0.1), at(0.13, 0.1), 0.7)
