@@ -4,12 +4,20 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 from small_world import CAMERA, around, looking_at, objects
 
 from calibslam_backend.box_measurement import BoxMeasurement
 from calibslam_backend.initialisation import InitialisationSettings, Initialised, initialise
-from calibslam_backend.quadric import ALL_EDGES, Ellipsoid, box_of_visible_part, image_bounds
+from calibslam_backend.quadric import (
+    ALL_EDGES,
+    Ellipsoid,
+    box_of_visible_part,
+    image_bounds,
+    matrix_from_vector,
+    vector_from_matrix,
+)
 from calibslam_msgs_py.measurements import Array
 
 BOUNDS = image_bounds(CAMERA.width, CAMERA.height)
@@ -56,6 +64,18 @@ def test_boxes_cut_by_the_image_are_no_smaller_objects() -> None:
     np.testing.assert_allclose(found.vector, truth.vector(), atol=5e-3)
 
 
+def test_the_prior_knows_no_direction() -> None:
+    """Turning the map does not change it: Q P Q^T = P, with Q the turn of (t, L)."""
+    prior, rng = InitialisationSettings().prior_covariance(), np.random.default_rng(0)
+    for _ in range(10):
+        R = Rotation.random(rng=rng).as_matrix()
+        Q = np.zeros((9, 9))
+        Q[:3, :3] = R
+        for n, unit in enumerate(np.eye(6)):
+            Q[3:, 3 + n] = vector_from_matrix(R @ matrix_from_vector(unit) @ R.T)
+        np.testing.assert_allclose(Q @ prior @ Q.T, prior, atol=1e-9)
+
+
 def test_too_few_boxes() -> None:
     truth, poses = objects()[0], around(12)
     settings = InitialisationSettings(min_boxes=6)
@@ -77,8 +97,9 @@ def test_an_object_behind_the_camera_is_none() -> None:
     aside = np.linspace(-0.3, 0.3, 12)
     poses[:, :3, 3] += aside[:, None] * first[:3, 0]
     boxes = measured(truth, poses)
-    assert start(poses, boxes) is not None
-    assert start(poses[::-1].copy(), boxes) is None
+    # Seen from one side only, its depth is known by the prior on its shape.
+    assert start(poses, boxes, InitialisationSettings()) is not None
+    assert start(poses[::-1].copy(), boxes, InitialisationSettings()) is None
 
 
 def test_boxes_of_two_objects_are_refused() -> None:
