@@ -31,7 +31,8 @@ def load_kernels() -> None:
     values.insert(1, vector)
     box_factor(0, 1, boxes[0], K, 1.0).linearize(values)
     initialise(np.stack([pose.matrix() for pose in poses]), boxes, K, 1.0, InitialisationSettings())
+    everything = np.ones((1, 1), np.bool_)
     overlaps_at(
-        poses[0].matrix(), vector[None, :3], np.eye(3)[None], K, bounds[2:], bounds[None], np.ones((1, 1), bool)
+        np.eye(4), vector[None, :3].copy(), np.eye(3)[None], K, bounds[2:].copy(), bounds[None].copy(), everything
     )
     localise(poses[0].matrix(), np.eye(6), [values.atVector(1)], boxes[:1], K, 1.0, 1.0)

@@ -72,14 +72,17 @@ def relocalise(
         return None
     corners = np.stack([box.corners for box in boxes])
     shapes, sizes = _shapes(quadrics)
-    size = np.array(image, dtype=np.float64)
+    size, centres = np.array(image, dtype=np.float64), np.ascontiguousarray(quadrics[:, :3])
+
+    def overlaps(T: Array) -> Array:
+        # One memory layout for all: numba compiles anew for each.
+        return np.asarray(overlaps_at(np.ascontiguousarray(T), centres, shapes, K, size, corners, compatible))
 
     def explained(T: Array) -> list[tuple[int, int]]:
-        overlaps = overlaps_at(T, quadrics[:, :3], shapes, K, size, corners, compatible)
-        return _one_to_one(overlaps, settings.relocalisation_overlap)
+        return _one_to_one(overlaps(T), settings.relocalisation_overlap)
 
     def score(T: Array) -> float:
-        return float(overlaps_at(T, quadrics[:, :3], shapes, K, size, corners, compatible).max(axis=1).sum())
+        return float(overlaps(T).max(axis=1).sum())
 
     needed = max(settings.relocalisation_boxes, len(explained(predicted)) + settings.relocalisation_gain)
     if len(boxes) < needed:
