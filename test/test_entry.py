@@ -140,7 +140,5 @@ def test_unknown_executable_lists_those_there_are() -> None:
 
 
 def test_shell_has_everything_on_the_path() -> None:
-    result = calibslam(
-        PROJECT, "shell", "-c", 'python -c "import rclpy, calibslam_msgs.msg" && echo $ROS_DISTRO'
-    )
+    result = calibslam(PROJECT, "shell", "-c", 'python -c "import rclpy, calibslam_msgs.msg" && echo $ROS_DISTRO')
     assert (result.returncode, result.stdout) == (0, "jazzy\n"), result.stderr

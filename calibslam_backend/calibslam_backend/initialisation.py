@@ -8,7 +8,7 @@ graph. An object that cannot be told yet (too few views, rays too parallel) wait
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numba
 import numpy as np
@@ -19,6 +19,8 @@ from calibslam_backend.box_measurement import BoxMeasurement
 from calibslam_backend.quadric import Ellipsoid
 from calibslam_msgs_py.measurements import Array
 from calibslam_msgs_py.settings import Settings, setting
+
+FREE = 1e3  # standard deviation of a prior that says nothing [m, log m]
 
 
 @dataclass(frozen=True)
@@ -84,6 +86,7 @@ def initialise(
     guess = _first_guess(poses, corners, clip, K)
     if guess is None:
         return None
+    prior = np.linalg.inv(settings.prior_covariance())
     vector, information, distances = _refine(
         np.ascontiguousarray(poses),
         guess,
@@ -93,11 +96,14 @@ def initialise(
         bounds,
         clip,
         robust_scale,
-        np.linalg.inv(settings.prior_covariance()),
+        prior,
     )
     covariance = np.linalg.inv(information)
+    # What the boxes say of centre and size must not be helped by priors that are but a first guess.
+    free = replace(settings, prior_centre=FREE, prior_size=FREE)
+    by_boxes = np.linalg.inv(information - prior + np.linalg.inv(free.prior_covariance()))
     depth = np.median(np.linalg.norm(poses[:, :3, 3] - vector[:3], axis=1))
-    centre_sigma = np.sqrt(np.linalg.eigvalsh(covariance[:3, :3])[-1])
+    centre_sigma = np.sqrt(np.linalg.eigvalsh(by_boxes[:3, :3])[-1])
     largest = Ellipsoid.from_vector(vector).radii.max()
     if (
         not np.isfinite(distances).all()

@@ -65,8 +65,6 @@ class OdometryDifferencer:
         if stamp == self._stamp:
             raise InvalidMeasurement("duplicate", f"odometry at {stamp} ns came twice")
         last_stamp, last_T = self._stamp, self._T
-        if last_stamp is not None and stamp == last_stamp:
-            raise InvalidMeasurement("duplicate", f"odometry at {stamp} ns came twice")
         self._stamp, self._T = stamp, T_odom_body
         if last_stamp is None or last_T is None:
             return None

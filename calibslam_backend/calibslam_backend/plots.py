@@ -48,8 +48,8 @@ def plot_run(path: Path, title: str, result: ObjectMap, odometry: Array, truth: 
     top.plot(*result.poses[:, :2, 3].T, "-", color="tab:blue", linewidth=1.5, label="estimate")
     _objects(top, result)
     top.plot(*result.poses[0, :2, 3], "o", color="tab:green", label="start")
-    top.set(xlabel="x forward [m]", ylabel="y left [m]", title=f"{title}: seen from above", aspect="equal")
-    top.set_aspect("equal", adjustable="datalim")
+    top.set(xlabel="x forward [m]", ylabel="y left [m]", title=f"{title}: seen from above")
+    top.set_aspect("equal", adjustable="box")
     # An object whose place is hardly known must not shrink everything else to a dot.
     everything = np.concatenate([odometry[:, :2, 3], result.poses[:, :2, 3]])
     low, high = everything.min(axis=0) - MARGIN, everything.max(axis=0) + MARGIN

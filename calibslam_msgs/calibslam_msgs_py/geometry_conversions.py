@@ -25,8 +25,8 @@ SECOND = 1_000_000_000  # [ns]
 
 
 def doubles_of(values: Any, n: int, what: str) -> Array:
-    """(n,) float64 of an array field."""
-    flat = np.asarray(values, dtype=np.float64).ravel()
+    """(n,) float64 of an array field: a copy, since what comes out of a bag is read-only."""
+    flat = np.array(values, dtype=np.float64).ravel()
     if flat.size != n:
         raise InvalidMeasurement("shape", f"{what} has {flat.size} numbers instead of {n}")
     return flat
