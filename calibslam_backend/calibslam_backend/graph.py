@@ -18,6 +18,7 @@ from gtsam import symbol
 from calibslam_backend.box_factor import box_factor
 from calibslam_backend.box_measurement import BoxMeasurement
 from calibslam_backend.initialisation import InitialisationSettings
+from calibslam_backend.odometry import dead_reckoning
 from calibslam_backend.quadric import matrix_from_vector
 from calibslam_msgs_py.measurements import Array
 from calibslam_msgs_py.settings import Settings, setting
@@ -102,13 +103,7 @@ class ObjectGraph:
 
     def odometry(self) -> tuple[Array, Array]:
         """What odometry alone says: poses (N, 4, 4) and their covariances (N, 6, 6), from the same origin."""
-        poses = [self._origin]
-        covariances = [np.eye(6) * self._settings.prior_sigma**2]
-        for motion, covariance in self._motions:
-            back = gtsam.Pose3(motion).inverse().AdjointMap()
-            poses.append(poses[-1] * gtsam.Pose3(motion))
-            covariances.append(back @ covariances[-1] @ back.T + covariance)
-        return np.stack([pose.matrix() for pose in poses]), np.stack(covariances)
+        return dead_reckoning(self._origin.matrix(), np.eye(6) * self._settings.prior_sigma**2, self._motions)
 
     def quadric(self, j: int) -> Array:
         """(9,) centre and logarithmic shape."""

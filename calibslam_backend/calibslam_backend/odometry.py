@@ -7,6 +7,7 @@ which is what frame-to-frame visual odometry was seen to do on recordings of slo
 from __future__ import annotations
 
 from bisect import bisect_right
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import gtsam
@@ -74,6 +75,23 @@ class OdometryDifferencer:
         if covariance is not None:
             covariance = covariance * ((stamp - last_stamp) / SECOND) ** 2
         return RelativeMotion(last_stamp, stamp, np.linalg.inv(last_T) @ T_odom_body, covariance, frame_id)
+
+
+def dead_reckoning(start: Array, covariance: Array, steps: Iterable[tuple[Array, Array]]) -> tuple[Array, Array]:
+    """Poses (N + 1, 4, 4) and their covariances (N + 1, 6, 6) by odometry alone.
+
+    Args:
+        start: (4, 4) first pose.
+        covariance: (6, 6) of it, [rotation, translation] in the body.
+        steps: N motions (4, 4) in the body, each with its covariance (6, 6) in the body at its end.
+    """
+    poses, covariances = [gtsam.Pose3(start)], [covariance]
+    for motion, noise in steps:
+        step = gtsam.Pose3(motion)
+        back = step.inverse().AdjointMap()
+        poses.append(poses[-1] * step)
+        covariances.append(back @ covariances[-1] @ back.T + noise)
+    return np.stack([pose.matrix() for pose in poses]), np.stack(covariances)
 
 
 class MotionChain:

@@ -10,15 +10,15 @@ import json
 import sys
 from collections.abc import Sequence
 from dataclasses import asdict
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-import gtsam
 import numpy as np
 
 from calibslam_backend.metrics import NoGroundTruth, Trajectory, alignment
 from calibslam_backend.object_map import MapFileError, ObjectMap, tum_lines
-from calibslam_backend.odometry import MotionChain, MotionNoise
+from calibslam_backend.odometry import MotionChain, MotionNoise, dead_reckoning
 from calibslam_backend.plots import plot_run
 from calibslam_backend.quadric import Ellipsoid
 from calibslam_backend.run_folder import accuracy
@@ -66,13 +66,8 @@ def odometry_at(result: ObjectMap, motions: Sequence[RelativeMotion]) -> tuple[A
     chain = MotionChain(MotionNoise(), np.eye(4))
     for motion in motions:
         chain.add(motion)
-    poses, covariances = [result.poses[0]], [result.covariances[0]]
-    for start, end in zip(result.stamps[:-1], result.stamps[1:], strict=True):
-        step, noise = chain.between(start, end)
-        back = gtsam.Pose3(step).inverse().AdjointMap()
-        poses.append(poses[-1] @ step)
-        covariances.append(back @ covariances[-1] @ back.T + noise)
-    return np.stack(poses), np.stack(covariances)
+    steps = [chain.between(start, end) for start, end in pairwise(result.stamps)]
+    return dead_reckoning(result.poses[0], result.covariances[0], steps)
 
 
 def table(metrics: dict[str, Any]) -> str:
