@@ -55,6 +55,12 @@ class Prediction:
     class_id: str
 
 
+def predicted_corners(T_map_camera: Array, quadric: Array, K: Array, box: BoxMeasurement) -> Array | None:
+    """The corners alone (4,) [px] of `predict`."""
+    visible, corners, _ = box_of_visible_part(T_map_camera, quadric, K, box.bounds, box.clip)
+    return np.asarray(corners) if visible else None
+
+
 def predict(
     T_map_camera: Array,
     quadric: Array,
@@ -81,8 +87,9 @@ def predict(
     return corners, J @ covariance @ J.T + own
 
 
-def distances(predictions: list[Prediction], boxes: list[BoxMeasurement], classes: list[str],
-              settings: AssociationSettings) -> Array:  # fmt: skip
+def distances(
+    predictions: list[Prediction], boxes: list[BoxMeasurement], classes: list[str], settings: AssociationSettings
+) -> Array:
     """Negative log-likelihood (landmarks, boxes) of a pair; infinite outside the gate."""
     gate = chi2.ppf(settings.gate, 4)
     result = np.full((len(predictions), len(boxes)), np.inf)

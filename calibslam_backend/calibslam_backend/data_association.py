@@ -19,6 +19,7 @@ from calibslam_backend.association import (
     assign,
     distances,
     predict,
+    predicted_corners,
     same_object,
 )
 from calibslam_backend.box_measurement import BoxMeasurement, prepare
@@ -118,10 +119,8 @@ class DataAssociation:
             candidate = self._candidates[track]
             if candidate.landmark is None:
                 continue
-            prediction = predict(
-                T, self._graph.quadric(candidate.landmark), np.zeros((15, 15)), self.camera.K, box, 0.0
-            )
-            fits = prediction is not None and (overlap(prediction[0][None], box.corners[None])[0, 0] >= self.LEAST_FIT)
+            corners = predicted_corners(T, self._graph.quadric(candidate.landmark), self.camera.K, box)
+            fits = corners is not None and overlap(corners[None], box.corners[None])[0, 0] >= self.LEAST_FIT
             seen = any(n == k for n, _ in self._graph.landmarks[candidate.landmark].boxes[-2:])
             if fits and not seen:
                 self._graph.add_box(k, candidate.landmark, box)
@@ -176,12 +175,10 @@ class DataAssociation:
         known = [j for j, landmark in self._graph.landmarks.items() if landmark.factors]
         if not known:
             return
-        classes = [self._class_of(t) for t in tracks]
-        compatible = np.array([[self.class_of_quadric(j) == c for j in known] for c in classes])
         # A young quadric is what is in question: it may be an old one, seen from where the camera is not.
-        for m, j in enumerate(known):
-            if k - self._graph.landmarks[j].born <= self.YOUNG:
-                compatible[:, m] = False
+        old = np.array([k - self._graph.landmarks[j].born > self.YOUNG for j in known])
+        classes = np.array([self.class_of_quadric(j) for j in known])
+        compatible = np.stack([old & (classes == self._class_of(track)) for track in tracks])
         found = relocalise(
             self._graph.pose(k),
             measurements,
@@ -319,9 +316,9 @@ class DataAssociation:
 
     def _in_question(self, T_map_camera: Array, j: int, boxes: list[BoxMeasurement]) -> bool:
         """Whether one of these boxes may be of a quadric: worth the cost of its joint covariance with the pose."""
-        prediction = predict(T_map_camera, self._graph.quadric(j), np.zeros((15, 15)), self.camera.K, boxes[0], 0.0)
-        corners = np.stack([box.corners for box in boxes])
-        return prediction is not None and bool(overlap(prediction[0][None], corners).max() >= self.settings.min_overlap)
+        predicted = predicted_corners(T_map_camera, self._graph.quadric(j), self.camera.K, boxes[0])
+        measured = np.stack([box.corners for box in boxes])
+        return predicted is not None and bool(overlap(predicted[None], measured).max() >= self.settings.min_overlap)
 
     def _seen_apart(self, candidate: Candidate, landmark: int) -> bool:
         """Whether an image shows both the track and the landmark, as two boxes."""

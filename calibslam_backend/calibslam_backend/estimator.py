@@ -27,10 +27,11 @@ from calibslam_backend.estimator_settings import EstimatorSettings
 from calibslam_backend.graph import ObjectGraph
 from calibslam_backend.kernels import load_kernels
 from calibslam_backend.object_map import ObjectMap
-from calibslam_backend.odometry import SECOND, MotionChain
+from calibslam_backend.odometry import MotionChain
 from calibslam_backend.quadric import Ellipsoid, covariance_of_pose_and_radii, covariance_of_vector
 from calibslam_backend.tracking import Tracker, unique
 from calibslam_msgs_py.measurements import (
+    SECOND,
     Array,
     Boxes,
     Camera,

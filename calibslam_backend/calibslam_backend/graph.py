@@ -78,6 +78,7 @@ class ObjectGraph:
         self._K = np.ascontiguousarray(K, float)
         self._settings = settings
         self._prior = priors.prior_covariance()
+        self._has_origin = False
         self._motions: list[tuple[Array, Array]] = []  # between consecutive poses, with covariance
         self.landmarks: dict[int, Landmark] = {}
         self._origin = gtsam.Pose3(T_MAP_FIRST_CAMERA)
@@ -315,8 +316,6 @@ class ObjectGraph:
         return gtsam.ISAM2(parameters)
 
     # -- factors ------------------------------------------------------------------------------------------------
-
-    _has_origin = False
 
     def _begin_change(self) -> None:
         self._new_factors = gtsam.NonlinearFactorGraph()

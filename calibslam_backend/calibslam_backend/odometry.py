@@ -13,10 +13,8 @@ from dataclasses import dataclass
 import gtsam
 import numpy as np
 
-from calibslam_msgs_py.measurements import Array, InvalidMeasurement, RelativeMotion
+from calibslam_msgs_py.measurements import SECOND, Array, InvalidMeasurement, RelativeMotion
 from calibslam_msgs_py.settings import Settings, setting
-
-SECOND = 1_000_000_000  # [ns]
 
 
 @dataclass(frozen=True)

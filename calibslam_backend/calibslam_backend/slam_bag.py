@@ -13,14 +13,13 @@ from pathlib import Path
 import numpy as np
 
 from calibslam_backend.estimator import Estimator, EstimatorSettings, Keyframe
-from calibslam_backend.odometry import SECOND
 from calibslam_backend.published import POSE, map_messages, pose_message
 from calibslam_backend.recording import Recording
 from calibslam_backend.run_folder import RunRecord, write_run
 from calibslam_backend.transform import transform_from_text
 from calibslam_msgs_py import bags
 from calibslam_msgs_py.bags import BagError, BagReader, BagWriter
-from calibslam_msgs_py.measurements import Boxes, InvalidMeasurement
+from calibslam_msgs_py.measurements import SECOND, Boxes, InvalidMeasurement
 from calibslam_msgs_py.settings import SettingsError, add_arguments, from_arguments
 
 MAP_PERIOD = 1.0  # [s] of recorded time between two maps in run.mcap

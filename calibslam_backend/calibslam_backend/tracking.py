@@ -13,8 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
-from calibslam_backend.odometry import SECOND
-from calibslam_msgs_py.measurements import Array
+from calibslam_msgs_py.measurements import SECOND, Array
 from calibslam_msgs_py.settings import Settings, setting
 
 

@@ -8,8 +8,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from calibslam_backend.odometry import SECOND, MotionChain, MotionNoise, OdometryDifferencer
-from calibslam_msgs_py.measurements import Array, InvalidMeasurement, RelativeMotion
+from calibslam_backend.odometry import MotionChain, MotionNoise, OdometryDifferencer
+from calibslam_msgs_py.measurements import SECOND, Array, InvalidMeasurement, RelativeMotion
 
 T0 = 5 * SECOND
 STEP = SECOND // 10

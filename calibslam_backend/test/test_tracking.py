@@ -6,8 +6,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 from small_world import CAMERA
 
-from calibslam_backend.odometry import SECOND
 from calibslam_backend.tracking import Tracker, TrackingSettings, overlap, rotated, unique
+from calibslam_msgs_py.measurements import SECOND
 
 A = np.array([100.0, 100.0, 200.0, 200.0])
 B = np.array([300.0, 100.0, 420.0, 180.0])

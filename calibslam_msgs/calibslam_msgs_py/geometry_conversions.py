@@ -13,15 +13,13 @@ from calibslam_msgs_py.covariance import (
     ros_from_gtsam_covariance,
     symmetric,
 )
-from calibslam_msgs_py.measurements import Array, InvalidMeasurement, StampedPose
+from calibslam_msgs_py.measurements import SECOND, Array, InvalidMeasurement, StampedPose
 from calibslam_msgs_py.message_types import MessageTypes
 
 # covariance[0] of a message whose covariance is not known.
 UNKNOWN = -1.0
 # How far the norm of a quaternion may be from 1: text files with four decimals stay below, garbage does not.
 QUATERNION_TOLERANCE = 1e-3
-
-SECOND = 1_000_000_000  # [ns]
 
 
 def doubles_of(values: Any, n: int, what: str) -> Array:

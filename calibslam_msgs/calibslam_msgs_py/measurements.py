@@ -14,6 +14,8 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
+SECOND = 1_000_000_000  # [ns]
+
 
 class InvalidMeasurement(ValueError):
     """A measurement that must not enter the estimate; `reason` is a short name to count by."""

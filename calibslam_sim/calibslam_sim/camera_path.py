@@ -8,11 +8,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from calibslam_msgs_py.measurements import Array
+from calibslam_msgs_py.measurements import SECOND, Array
 from calibslam_sim.random_streams import stream
 
 START = 1_000_000_000_000  # [ns] far from 0, which many tools take for "no time"
-SECOND = 1_000_000_000
 LAP = 50.0  # [s] once around the desk at pace 1
 ORBIT = np.array([1.9, 1.6])  # [m] half axes of the walk around the table
 EYE_HEIGHT = 1.45  # [m]

@@ -7,17 +7,15 @@ from typing import Any
 import gtsam
 import numpy as np
 
+from calibslam_backend import recording
 from calibslam_msgs_py.conversions import odometry_to_msg
 from calibslam_msgs_py.measurements import Array, StampedPose
 from calibslam_msgs_py.message_types import MessageTypes
 
-ODOMETRY = "/odom"
-DETECTIONS = "/detections"
-DETECTIONS_WITHOUT_COVARIANCE = "/detections_raw"
-CAMERA_INFO = "/camera/camera_info"
+DETECTIONS, DETECTIONS_WITHOUT_COVARIANCE = recording.BOXES, recording.RAW_BOXES
+CAMERA_INFO, ODOMETRY, GROUND_TRUTH = recording.CAMERA, recording.ODOMETRY, recording.GROUND_TRUTH
 IMAGE = "/camera/image_raw/compressed"
 DEPTH = "/camera/depth/image_raw"
-GROUND_TRUTH = "/ground_truth"
 GROUND_TRUTH_QUADRICS = "/ground_truth_quadrics"
 
 WORLD = "world"  # frame of the ground truth
