@@ -1,0 +1,126 @@
+"""`experiment NAME --out DIR`: one of the document's experiments, with table, JSON, CSV and figure.
+
+Conditions are compared on the same worlds and noise. Interrupt it as you like: the same command goes on where it
+stopped. The same command gives the same numbers, whatever the number of processes.
+"""
+
+from __future__ import annotations
+
+import argparse
+import shlex
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from calibslam_msgs_py.settings import SettingsError, add_arguments, from_arguments
+from calibslam_sim.experiments.design import Experiment, ExperimentError, ExperimentSettings
+from calibslam_sim.experiments.engine import run
+from calibslam_sim.experiments.outputs import result_of, table, write
+from calibslam_sim.experiments.registry import MODULES, load
+from calibslam_sim.experiments.run_store import RunStore
+from calibslam_sim.progress import Progress
+
+
+def perform(
+    name: str,
+    settings: ExperimentSettings,
+    out: Path,
+    repetitions: int,
+    jobs: int = -1,
+    backend: str = "loky",
+    overwrite: bool = False,
+    command: str = "",
+) -> dict[str, object]:
+    """Run an experiment, or what is missing of it in `out`, and write its results there; returns result.json.
+
+    Raises:
+        ExperimentError: it cannot be run with these settings, here, or in this folder.
+    """
+    experiment = load(name)
+    conditions = experiment.conditions(settings)
+    store = RunStore(out, name, settings, overwrite)
+    wanted = store.missing(conditions, repetitions)
+    with Progress(len(wanted), name) as progress:
+        for repetition in run(name, settings, wanted, jobs, backend):
+            store.add(repetition)
+            progress.step()
+    values = store.values(conditions, repetitions)
+    result = result_of(name, experiment, settings, values, command, store.seconds(conditions, repetitions))
+    write(result, out)
+    experiment.figure(result, out / f"{name}.png")
+    return result
+
+
+def _parser(argv: Sequence[str] | None) -> tuple[argparse.ArgumentParser, Experiment]:
+    """A parser with the options of the experiment that the arguments name, and this experiment."""
+    first = argparse.ArgumentParser(prog="experiment", add_help=False)
+    first.add_argument("name", choices=sorted(MODULES), metavar="NAME", help=" | ".join(sorted(MODULES)))
+    first.add_argument("--quick", action="store_true", help="reduced sizes: whether it runs, not what is true")
+    parser = argparse.ArgumentParser(
+        prog="experiment",
+        description=__doc__,
+        parents=[first],
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+        epilog="experiment NAME --help tells the options of one experiment.",
+    )
+    arguments = sys.argv[1:] if argv is None else list(argv)
+    if not any(word in MODULES for word in arguments):
+        parser.parse_args(arguments)  # shows help or says what is wrong
+    chosen = first.parse_known_args([word for word in arguments if word not in ("-h", "--help")])[0]
+    experiment = load(chosen.name)
+    repetitions = experiment.quick_seeds if chosen.quick else experiment.seeds
+    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder of the result")
+    parser.add_argument("--seeds", type=_positive, default=repetitions, help="repetitions (default: %(default)s)")
+    parser.add_argument("--jobs", type=int, default=-1, help="processes (default: one for each core)")
+    parser.add_argument(
+        "--backend",
+        default="loky",
+        help="of joblib, by name: loky, multiprocessing, sequential; dask at DASK_SCHEDULER_ADDRESS, or ray at "
+        "RAY_ADDRESS, where installed (default: %(default)s)",
+    )
+    parser.add_argument("--overwrite", action="store_true", help="begin anew in a folder that is in use")
+    parser.description = f"{chosen.name}: {experiment.title}\n\n{__doc__}"
+    add_arguments(parser, experiment.settings)
+    if chosen.quick:
+        parser.set_defaults(**experiment.quick)
+    return parser, experiment
+
+
+def _positive(text: str) -> int:
+    number = int(text)
+    if number < 1:
+        raise argparse.ArgumentTypeError("must be at least 1")
+    return number
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Command line of `experiment`; returns the exit code."""
+    parser, experiment = _parser(argv)
+    arguments = parser.parse_args(argv)
+    words = sys.argv[1:] if argv is None else list(argv)
+    command = shlex.join(["./calibslam", "run", "calibslam_sim", "experiment", *words])
+    try:
+        settings = from_arguments(arguments, experiment.settings)
+        result = perform(
+            arguments.name,
+            settings,
+            arguments.out,
+            arguments.seeds,
+            arguments.jobs,
+            arguments.backend,
+            arguments.overwrite,
+            command,
+        )
+    except KeyboardInterrupt:
+        print("experiment: interrupted; the same command goes on where it stopped", file=sys.stderr)
+        return 130
+    except (ExperimentError, SettingsError, OSError) as error:
+        print(f"experiment: {error}", file=sys.stderr)
+        return 1
+    print(f"{experiment.title}\n\n{table(result, experiment.metrics)}\n")
+    print(f"{arguments.out}/: result.json, result.csv, {arguments.name}.png")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,73 @@
+"""Means, deviations and paired tests over repetitions.
+
+Two conditions see the same worlds and the same unit noise, so the test is on their differences: Student's paired t,
+and beside it Wilcoxon's signed ranks, which a few large differences cannot decide. Both two-sided.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from scipy import stats
+
+from calibslam_msgs_py.measurements import Array
+
+CONFIDENCE = 0.95
+
+
+def summary(values: Sequence[float]) -> dict[str, Any]:
+    """Mean, sample deviation (n - 1) and the values of one metric in one condition.
+
+    Repetitions in which the metric is not defined (NaN) are None and do not count.
+    """
+    numbers = defined(values)
+    return {
+        "mean": float(numbers.mean()) if len(numbers) else None,
+        "std": float(numbers.std(ddof=1)) if len(numbers) > 1 else None,
+        "values": [None if np.isnan(value) else float(value) for value in values],
+    }
+
+
+def paired(a: Sequence[float], b: Sequence[float]) -> dict[str, float | None]:
+    """Mean of a - b (negative: a has less error) and the p-values of "no difference".
+
+    Repetitions in which one of the two is not defined do not count. None where fewer than two are left; no
+    difference anywhere has p = 1.
+    """
+    differences = defined(np.asarray(a, float) - np.asarray(b, float))
+    if len(differences) < 2:
+        return {"mean_difference": None, "p_value": None, "wilcoxon_p_value": None}
+    if not differences.any():
+        return {"mean_difference": 0.0, "p_value": 1.0, "wilcoxon_p_value": 1.0}
+    return {
+        "mean_difference": float(differences.mean()),
+        "p_value": float(stats.ttest_1samp(differences, 0.0).pvalue),
+        "wilcoxon_p_value": float(stats.wilcoxon(differences).pvalue),
+    }
+
+
+def nees_interval(degrees_of_freedom: int, repetitions: int) -> tuple[float, float]:
+    """Where the mean of independent normalised squared errors lies with 95 % if the covariances are right.
+
+    The sum over N repetitions is chi-squared with N times the degrees of freedom of one.
+    """
+    total = degrees_of_freedom * repetitions
+    low, high = stats.chi2.interval(CONFIDENCE, total)
+    return float(low / repetitions), float(high / repetitions)
+
+
+def half_interval(values: Sequence[float] | Array) -> float:
+    """Half the width of the 95 % interval (Student's t) of a mean; 0 for a single value."""
+    numbers = defined(values)
+    if len(numbers) < 2:
+        return 0.0
+    error = numbers.std(ddof=1) / np.sqrt(len(numbers))
+    return float(stats.t.ppf(0.5 + CONFIDENCE / 2.0, len(numbers) - 1) * error)
+
+
+def defined(values: Sequence[float] | Array) -> Array:
+    """The values that are not NaN (or None)."""
+    numbers = np.asarray(values, float)
+    return numbers[~np.isnan(numbers)]
