@@ -5,16 +5,27 @@ from __future__ import annotations
 import argparse
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from calibslam_msgs_py import bags
-from calibslam_msgs_py.conversions import boxes_to_msg, camera_to_msg, quadrics_to_msg, stamped_pose_to_msg
+from calibslam_msgs_py.conversions import (
+    boxes_to_msg,
+    camera_to_msg,
+    header_to_msg,
+    quadrics_to_msg,
+    stamped_pose_to_msg,
+)
 from calibslam_msgs_py.measurements import QuadricEstimate, StampedPose
 from calibslam_msgs_py.settings import add_arguments, from_arguments
 from calibslam_sim import topics
+from calibslam_sim.coco_writer import CocoError, CocoWriter
+from calibslam_sim.progress import Progress
+from calibslam_sim.render import RenderedImage, Renderer
+from calibslam_sim.render_looks import FAMILIES
 from calibslam_sim.simulation import SCENARIOS, Simulation, SimulationSettings, simulate
 
 SCENARIO_HELP = "which defaults the other options have (default: desk); " + "; ".join(
@@ -23,11 +34,21 @@ SCENARIO_HELP = "which defaults the other options have (default: desk); " + "; "
 )
 
 
-def write_bag(simulation: Simulation, path: Path, overwrite: bool = False) -> None:
+def write_bag(
+    simulation: Simulation,
+    path: Path,
+    overwrite: bool = False,
+    render: Callable[[int], RenderedImage] | None = None,
+    coco: CocoWriter | None = None,
+) -> None:
     """Write what was measured and the truth.
 
     Topics: /odom, /detections, /camera/camera_info and /ground_truth for every image, /ground_truth_quadrics
     once. The identity of a box is the id of the true quadric.
+
+    Args:
+        render: makes the image of a time; then there is /camera/image_raw/compressed as well.
+        coco: takes these images and their boxes, too.
     """
     types = bags.types
     T_odom_camera = [np.eye(4)]
@@ -47,7 +68,7 @@ def write_bag(simulation: Simulation, path: Path, overwrite: bool = False) -> No
         )
         for thing in simulation.world
     ]
-    with bags.BagWriter(path, overwrite) as bag:
+    with bags.BagWriter(path, overwrite) as bag, Progress(len(times), f"writing {path}") as progress:
         bag.write(topics.GROUND_TRUTH_QUADRICS, quadrics_to_msg(times[0], quadrics, types, topics.WORLD), times[0])
         for k, odometry in enumerate(topics.odometry_msgs(poses, step_covariance, types)):
             stamp = times[k]
@@ -56,6 +77,18 @@ def write_bag(simulation: Simulation, path: Path, overwrite: bool = False) -> No
             bag.write(topics.CAMERA_INFO, camera_to_msg(simulation.camera, stamp, types), stamp)
             bag.write(topics.GROUND_TRUTH, stamped_pose_to_msg(truth, topics.WORLD, types), stamp)
             bag.write(topics.DETECTIONS, boxes_to_msg(simulation.boxes[k], types), stamp)
+            if render is not None:
+                image = render(stamp)
+                bag.write(topics.IMAGE, _image(stamp, simulation.camera.frame_id, image), stamp)
+                if coco is not None:
+                    coco.add(image, simulation.world)
+            progress.step()
+
+
+def _image(stamp: int, frame_id: str, image: RenderedImage) -> Any:
+    return bags.types("sensor_msgs/msg/CompressedImage")(
+        header=header_to_msg(stamp, frame_id, bags.types), format="jpeg", data=bags.types.octets(image.jpeg())
+    )
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -67,15 +100,31 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="simulate", description=__doc__, parents=[first])
     parser.add_argument("--out", type=Path, required=True, metavar="BAG", help="folder to write")
     parser.add_argument("--overwrite", action="store_true", help="replace the bag if it exists")
+    parser.add_argument("--images", action="store_true", help="render the images, too (about 0.1 s each)")
+    parser.add_argument(
+        "--looks", choices=FAMILIES, default=FAMILIES[0], help="of rendered images (default: %(default)s)"
+    )
+    parser.add_argument(
+        "--coco", type=Path, metavar="DIR", help="folder for the rendered images with their boxes as COCO json"
+    )
     add_arguments(parser, SimulationSettings)
     parser.set_defaults(**SCENARIOS[scenario])
     arguments = parser.parse_args(argv)
+    if arguments.coco is not None and not arguments.images:
+        parser.error("--coco needs --images")
     settings = from_arguments(arguments, SimulationSettings)
     start = time.monotonic()
     try:
         simulation = simulate(settings)
-        write_bag(simulation, arguments.out, arguments.overwrite)
-    except bags.BagError as error:
+        render, coco = None, None
+        if arguments.images:
+            render = Renderer(simulation.world, simulation.camera, settings.seed, settings.pace, arguments.looks).render
+        if arguments.coco is not None:
+            coco = CocoWriter(arguments.coco, arguments.overwrite)
+        write_bag(simulation, arguments.out, arguments.overwrite, render, coco)
+        if coco is not None:
+            coco.close()
+    except (bags.BagError, CocoError) as error:
         print(f"simulate: {error}", file=sys.stderr)
         return 1
     print(

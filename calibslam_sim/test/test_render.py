@@ -1,0 +1,149 @@
+"""Rendered images: repeatable, with boxes that are those of what is seen, and classes that can be told apart."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from pycocotools.coco import COCO
+
+from calibslam_backend.quadric import Ellipsoid
+from calibslam_msgs_py.bags import BagReader
+from calibslam_msgs_py.measurements import SECOND, Camera
+from calibslam_sim import render_dataset, simulate, topics
+from calibslam_sim.camera_path import START
+from calibslam_sim.coco_writer import CLASSES
+from calibslam_sim.render import SAME_EDGE, Renderer
+from calibslam_sim.render_kernels import cast, visible_parts
+from calibslam_sim.render_looks import FAMILIAR, FAMILIES, FOREIGN
+from calibslam_sim.simulation import CAMERA
+from calibslam_sim.world import desk_world
+
+K = np.array([[100.0, 0.0, 80.0], [0.0, 100.0, 60.0], [0.0, 0.0, 1.0]])
+SMALL = Camera(width=160, height=120, K=K, distortion=np.zeros(5))
+NO_ROOM = np.array([-50.0, -50.0, -50.0, 50.0, 50.0, 50.0])
+
+
+def cast_two(spheres: list[tuple[list[float], float]]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Ids, depths and pixels of whole spheres (centre, radius) seen from the origin."""
+    ids, depths = np.empty((120, 160), np.int16), np.empty((120, 160), np.float32)
+    centres = np.array([centre for centre, _ in spheres])
+    whitening = np.array([np.eye(3) / radius for _, radius in spheres])
+    rectangles = np.tile(np.array([0, 160, 0, 120]), (len(spheres), 1))
+    whole = np.empty(len(spheres), np.int64)
+    cast(K, np.eye(4), NO_ROOM, np.empty((0, 6)), centres, whitening, rectangles, ids, depths, whole)
+    return ids, depths, whole
+
+
+def test_a_sphere_is_where_geometry_says() -> None:
+    # Radius 0.6 at 3 m: tangent of the half angle 0.6 / sqrt(9 - 0.36), times 100 px.
+    ids, depths, whole = cast_two([([0.0, 0.0, 3.0], 0.6)])
+    pixels, boxes = visible_parts(ids, 1)
+    radius = 100.0 * 0.6 / np.sqrt(9.0 - 0.36)
+    np.testing.assert_allclose(boxes[0], [80 - radius, 60 - radius, 80 + radius, 60 + radius], atol=0.6)
+    assert pixels[0] == whole[0] == pytest.approx(np.pi * radius**2, rel=0.02)
+    assert depths[60, 80] == pytest.approx(2.4, abs=1e-3)
+    assert depths[0, 0] == pytest.approx(50.0)
+
+
+def test_the_nearer_sphere_hides_the_other() -> None:
+    ids, _, whole = cast_two([([0.0, 0.0, 3.0], 0.6), ([0.3, 0.0, 2.0], 0.2)])
+    pixels, boxes = visible_parts(ids, 2)
+    assert ids[60, 95] == 1 and ids[60, 70] == 0
+    assert pixels[0] < whole[0] and pixels[1] == whole[1]
+    # About 10 px above and below the equator the far sphere, of radius 20.4 px, is the outer one again.
+    assert boxes[0, 2] == pytest.approx(80 + np.sqrt(20.4**2 - 10.0**2), abs=1.0)
+
+
+def test_the_same_seed_gives_the_same_image() -> None:
+    world = desk_world(3)
+    first, second = (Renderer(world, SMALL, 3, 1.0, "familiar").render(START) for _ in range(2))
+    np.testing.assert_array_equal(first.image, second.image)
+    np.testing.assert_array_equal(first.visible_boxes, second.visible_boxes)
+    assert first.jpeg() == second.jpeg()
+    assert (Renderer(world, SMALL, 4, 1.0, "familiar").render(START).image != first.image).mean() > 0.5
+
+
+def test_boxes_are_those_of_the_visible_parts() -> None:
+    """Visible inside whole; equal where nothing is in front."""
+    image = Renderer(desk_world(0), CAMERA, 0, 1.0, "familiar").render(START + 3 * SECOND)
+    seen = image.visible_shares > 0.0
+    assert seen.sum() >= 8
+    visible, whole = image.visible_boxes[seen], image.whole_boxes[seen]
+    assert (visible[:, :2] >= whole[:, :2] - SAME_EDGE).all() and (visible[:, 2:] <= whole[:, 2:] + SAME_EDGE).all()
+    free = image.visible_shares[seen] == 1.0
+    assert free.any() and not free.all()
+    np.testing.assert_array_equal(visible[free], whole[free])
+    assert np.isnan(image.visible_boxes[~seen]).all()
+
+
+def test_an_object_is_drawn_in_its_box() -> None:
+    """Without its object the image differs inside the box, and hardly outside (its shadow, the exposure)."""
+    world = desk_world(0)
+    k = next(thing.id for thing in world if thing.class_id == "potted plant")
+    gone = np.eye(4)
+    gone[:3, 3] = [0.0, 0.0, -30.0]
+    without = tuple(
+        replace(thing, ellipsoid=Ellipsoid(gone, thing.ellipsoid.radii)) if thing.id == k else thing for thing in world
+    )
+    for second in range(0, 50, 5):
+        images = [Renderer(w, CAMERA, 0, 1.0, "familiar").render(START + second * SECOND) for w in (world, without)]
+        if images[0].visible_shares[k] == 1.0 and images[0].in_image_shares[k] == 1.0:
+            break
+    difference = np.abs(images[0].image.astype(int) - images[1].image).max(axis=2) > 40
+    rows, columns = np.nonzero(difference)
+    xmin, ymin, xmax, ymax = images[0].visible_boxes[k]
+    inside = (columns + 1 > xmin - 4) & (columns < xmax + 4) & (rows + 1 > ymin - 4) & (rows < ymax + 4)
+    assert inside.mean() > 0.9
+    assert difference[int(ymin) : int(ymax), int(xmin) : int(xmax)].mean() > 0.4
+
+
+def test_every_class_has_its_own_look_in_both_families() -> None:
+    for family in (FAMILIAR, FOREIGN):
+        assert set(family) == set(CLASSES)
+        assert len({(look.pattern, look.colours) for look in family.values()}) == len(CLASSES)
+    assert all(FAMILIAR[name].pattern != FOREIGN[name].pattern for name in CLASSES)
+    first, second = (Renderer(desk_world(0), SMALL, 0, 1.0, family).render(START) for family in FAMILIES)
+    np.testing.assert_array_equal(first.whole_boxes, second.whole_boxes)
+    assert (first.image != second.image).mean() > 0.5
+
+
+def test_a_bag_holds_the_images_and_a_folder_their_boxes(tmp_path: Path) -> None:
+    bag, coco = tmp_path / "bag", tmp_path / "coco"
+    arguments = ["--out", str(bag), "--images", "--coco", str(coco), "--duration", "0.1", "--seed", "2"]
+    assert simulate.main(arguments) == 0
+    with BagReader(bag) as reader:
+        images = [message for _, _, message in reader.messages([topics.IMAGE])]
+        boxes = [message for _, _, message in reader.messages([topics.DETECTIONS])]
+    assert [m.header.stamp for m in images] == [m.header.stamp for m in boxes]
+    assert images[0].header.frame_id == CAMERA.frame_id and images[0].format == "jpeg"
+    files = sorted((coco / "images").iterdir())
+    assert [file.read_bytes() for file in files] == [bytes(message.data) for message in images]
+    assert cv2.imread(str(files[0])).shape == (480, 640, 3)
+    data = COCO(str(coco / "annotations.json"))
+    assert [c["name"] for c in data.loadCats(data.getCatIds())] == list(CLASSES)
+    clear = data.loadAnns(data.getAnnIds(imgIds=[1], iscrowd=False))
+    assert clear and all(a["visible_share"] >= 0.3 and min(a["bbox"][2:]) >= 8.0 for a in clear)
+    # The bag is there already; neither it nor the data set is touched.
+    assert simulate.main(arguments) == 1
+
+
+def test_a_data_set_of_several_worlds(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    arguments = ["--out", str(tmp_path / "d"), "--worlds", "2", "--images-per-world", "1", "--looks", "foreign"]
+    assert render_dataset.main(arguments) == 0
+    content = json.loads((tmp_path / "d" / "annotations.json").read_text())
+    assert [image["file_name"] for image in content["images"]] == ["000001.jpg", "000002.jpg"]
+    assert render_dataset.main(arguments) == 1
+    assert "not overwritten" in capsys.readouterr().err
+    assert render_dataset.main([*arguments, "--overwrite"]) == 0
+    (tmp_path / "d" / "mine.txt").touch()
+    assert render_dataset.main([*arguments, "--overwrite"]) == 1
+
+
+def test_coco_without_images_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(SystemExit):
+        simulate.main(["--out", str(tmp_path / "bag"), "--coco", str(tmp_path / "coco")])
