@@ -1,0 +1,186 @@
+"""Faster R-CNN (Ren et al., 2015) as torchvision has it, with a covariance head beside the box head.
+
+The boxes are those of the plain detector, bit for bit: the head sees what the detector has chosen and changes
+nothing of it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+from torchvision.models.detection import (
+    FasterRCNN,
+    fasterrcnn_mobilenet_v3_large_320_fpn,
+    fasterrcnn_resnet50_fpn_v2,
+)
+from torchvision.models.detection.backbone_utils import resnet_fpn_backbone
+from torchvision.models.detection.faster_rcnn import FastRCNNPredictor, TwoMLPHead
+from torchvision.ops import batched_nms, clip_boxes_to_image, remove_small_boxes
+from torchvision.ops.misc import FrozenBatchNorm2d
+
+from calibslam_detector.box_covariance import corner_covariances, rescaled
+from calibslam_detector.covariance_head import CovarianceHead, geometry
+
+COMPACT_FEATURES = 256  # of a region, a quarter of torchvision's: 8 instead of 19 million weights
+
+
+def _mobilenet(classes: int) -> FasterRCNN:
+    return fasterrcnn_mobilenet_v3_large_320_fpn(weights=None, weights_backbone=None, num_classes=classes)
+
+
+def _compact(classes: int) -> FasterRCNN:
+    detector = _mobilenet(classes)
+    pool = detector.roi_heads.box_roi_pool
+    inputs = detector.backbone.out_channels * pool.output_size[0] * pool.output_size[1]
+    detector.roi_heads.box_head = TwoMLPHead(inputs, COMPACT_FEATURES)
+    detector.roi_heads.box_predictor = FastRCNNPredictor(COMPACT_FEATURES, classes)
+    return detector
+
+
+def _resnet50(classes: int) -> FasterRCNN:
+    return fasterrcnn_resnet50_fpn_v2(weights=None, weights_backbone=None, num_classes=classes)
+
+
+def _resnet101(classes: int) -> FasterRCNN:
+    backbone = resnet_fpn_backbone(
+        backbone_name="resnet101", weights=None, trainable_layers=5, norm_layer=nn.BatchNorm2d
+    )
+    return FasterRCNN(backbone, classes)
+
+
+ARCHITECTURES: dict[str, Callable[[int], FasterRCNN]] = {
+    "compact": _compact,
+    "mobilenet_v3_large_320_fpn": _mobilenet,
+    "resnet50_fpn_v2": _resnet50,
+    "resnet101_fpn": _resnet101,
+}
+
+
+@dataclass(frozen=True)
+class Regions:
+    """The regions that a detector chose in one image, N of them, best first.
+
+    Attributes:
+        boxes: (N, 4) [px of the network's input], cut at the border.
+        scores, labels: (N,).
+        proposals: (N, 4) that the boxes were described against [px of the network's input].
+        features: (N, F) of the regions.
+        size: height and width of the network's input [px].
+    """
+
+    boxes: Tensor
+    scores: Tensor
+    labels: Tensor
+    proposals: Tensor
+    features: Tensor
+    size: tuple[int, int]
+
+    @property
+    def geometries(self) -> Tensor:
+        """(N, GEOMETRY), see `covariance_head.geometry`."""
+        return geometry(self.boxes, self.scores, self.size)
+
+
+class CalibratedDetector(nn.Module):
+    """A detector whose boxes have covariances.
+
+    `forward` is that of the plain detector, for training it.
+
+    Args:
+        architecture: of ARCHITECTURES.
+        class_names: without the background; the label of the first is 1.
+        frozen_norm: normalise by fixed numbers, as torchvision's COCO weights do, instead of those of a batch.
+    """
+
+    def __init__(self, architecture: str, class_names: tuple[str, ...], frozen_norm: bool = False) -> None:
+        super().__init__()
+        self.architecture, self.class_names, self.frozen_norm = architecture, class_names, frozen_norm
+        classes = len(class_names) + 1
+        self.detector = ARCHITECTURES[architecture](classes)
+        if frozen_norm:
+            freeze_norms(self.detector)
+        self.covariance_head = CovarianceHead(self.detector.roi_heads.box_predictor.cls_score.in_features, classes)
+
+    def forward(self, images: list[Tensor], targets: list[dict[str, Tensor]] | None = None) -> dict[str, Tensor]:
+        """Losses of the plain detector, of images (3, H, W) in [0, 1] and targets as torchvision has them."""
+        losses: dict[str, Tensor] = self.detector(images, targets)
+        return losses
+
+    def regions(self, images: list[Tensor]) -> list[Regions]:
+        """What the plain detector finds in images (3, H, W) in [0, 1], before sizes are put back.
+
+        Raises:
+            RuntimeError: the detector is in training mode.
+        """
+        if self.training:
+            raise RuntimeError("regions are found in evaluation mode only")
+        inputs, _ = self.detector.transform(images)
+        features = self.detector.backbone(inputs.tensors)
+        proposals, _ = self.detector.rpn(inputs, features)
+        heads = self.detector.roi_heads
+        vectors = heads.box_head(heads.box_roi_pool(features, proposals, inputs.image_sizes))
+        logits, deltas = heads.box_predictor(vectors)
+        boxes = heads.box_coder.decode(deltas, proposals)
+        scores = torch.softmax(logits, -1)
+        counts = [len(p) for p in proposals]
+        return [
+            self._choose(*of_image)
+            for of_image in zip(
+                boxes.split(counts), scores.split(counts), proposals, vectors.split(counts), inputs.image_sizes,
+                strict=True,
+            )
+        ]  # fmt: skip
+
+    def _choose(
+        self, boxes: Tensor, scores: Tensor, proposals: Tensor, features: Tensor, size: tuple[int, int]
+    ) -> Regions:
+        """Of all boxes (P, C, 4) and scores (P, C) of an image those that count, as torchvision chooses them."""
+        heads = self.detector.roi_heads
+        classes = scores.shape[1] - 1
+        flat_boxes = clip_boxes_to_image(boxes, size)[:, 1:].reshape(-1, 4)
+        flat_scores = scores[:, 1:].reshape(-1)
+        kept = torch.where(flat_scores > heads.score_thresh)[0]
+        kept = kept[remove_small_boxes(flat_boxes[kept], min_size=1e-2)]
+        best = batched_nms(flat_boxes[kept], flat_scores[kept], kept % classes + 1, heads.nms_thresh)
+        kept = kept[best[: heads.detections_per_img]]
+        of_proposal = torch.div(kept, classes, rounding_mode="floor")
+        return Regions(
+            boxes=flat_boxes[kept],
+            scores=flat_scores[kept],
+            labels=kept % classes + 1,
+            proposals=proposals[of_proposal],
+            features=features[of_proposal],
+            size=(int(size[0]), int(size[1])),
+        )
+
+    def covariances(self, regions: Regions) -> Tensor:
+        """(N, 4, 4) of the boxes of regions [px^2 of the network's input]."""
+        variances, couplings = self.covariance_head(regions.features, regions.geometries, regions.labels)
+        weights = self.detector.roi_heads.box_coder.weights
+        return corner_covariances(variances, couplings, regions.proposals, regions.boxes, weights)
+
+    def detect(self, images: list[Tensor]) -> list[dict[str, Tensor]]:
+        """Boxes (N, 4), labels and scores (N,) as torchvision returns them, and covariances (N, 4, 4) [px^2]."""
+        found = self.regions(images)
+        originals = [(int(image.shape[-2]), int(image.shape[-1])) for image in images]
+        plain = [{"boxes": r.boxes, "labels": r.labels, "scores": r.scores} for r in found]
+        results: list[dict[str, Tensor]] = self.detector.transform.postprocess(
+            plain, [r.size for r in found], originals
+        )
+        for result, regions, original in zip(results, found, originals, strict=True):
+            result["covariances"] = rescaled(self.covariances(regions), regions.size, original)
+        return results
+
+
+def freeze_norms(module: nn.Module) -> None:
+    """Replace batch normalisation by one with the same, fixed numbers."""
+    for name, child in module.named_children():
+        if isinstance(child, nn.BatchNorm2d):
+            frozen = FrozenBatchNorm2d(child.num_features, child.eps)
+            frozen.load_state_dict(child.state_dict())
+            setattr(module, name, frozen)
+        else:
+            freeze_norms(child)
