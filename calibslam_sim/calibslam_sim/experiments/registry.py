@@ -10,6 +10,7 @@ from calibslam_sim.experiments.design import Experiment
 MODULES = {
     "kalman": "calibslam_sim.experiments.kalman",
     "toy": "calibslam_sim.experiments.toy",
+    "quadric_sim": "calibslam_sim.experiments.quadric_sim",
 }
 
 
