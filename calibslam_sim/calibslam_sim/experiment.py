@@ -78,7 +78,9 @@ def _parser(argv: Sequence[str] | None) -> tuple[argparse.ArgumentParser, Experi
         help="of joblib, by name: loky, multiprocessing, sequential; dask at DASK_SCHEDULER_ADDRESS, or ray at "
         "RAY_ADDRESS, where installed (default: %(default)s)",
     )
-    parser.add_argument("--overwrite", action="store_true", help="begin anew in a folder that is in use")
+    parser.add_argument(
+        "--overwrite", action="store_true", help="begin anew in a folder that is in use, as after a change of code"
+    )
     parser.description = f"{chosen.name}: {experiment.title}\n\n{__doc__}"
     add_arguments(parser, experiment.settings)
     if chosen.quick:

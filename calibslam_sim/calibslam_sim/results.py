@@ -44,7 +44,7 @@ def block(result: dict[str, Any], experiment: Experiment) -> str:
     metrics = experiment.metrics
     rows = rows_of_conditions(result, metrics)
     shown = [metric for metric in metrics if metric in next(iter(result["conditions"].values()))]
-    for condition, theirs in reversed(experiment.document.items()):
+    for condition, theirs in experiment.document(result["settings"]).items():
         cells = [mean_and_deviation(*theirs[metric]) if metric in theirs else "" for metric in shown]
         at = [row[0] for row in rows].index(condition) + 1
         rows.insert(at, [f"*{condition}, the document*", *cells])

@@ -18,6 +18,7 @@ VALUES = {"overconfident": [2.0, 4.0], "calibrated": [1.0, 2.0], "underconfident
 def result() -> dict[str, Any]:
     return {
         "experiment": "toy",
+        "settings": {},
         "repetitions": 2,
         "conditions": {name: {"ate_m": summary(values)} for name, values in VALUES.items()},
         "paired": {

@@ -47,6 +47,7 @@ class Metric:
 
 
 Metrics = dict[str, float]
+DocumentNumbers = Mapping[str, Mapping[str, tuple[float, float | None]]]
 Seed = np.random.SeedSequence
 
 
@@ -65,7 +66,8 @@ class Experiment:
         comparisons: pairs (A, B) of conditions to be tested against each other.
         figure: draws a result (the content of result.json) into a PNG.
         degrees_of_freedom: of each metric that is a normalised squared error of independent repetitions.
-        document: mean and deviation in the document, of condition and metric; None: the document gives none.
+        document: settings -> mean and deviation in the document, of condition and metric; a deviation of None: it
+            states none.
         further: more entries of result.json, from the values of each metric in each condition.
     """
 
@@ -80,7 +82,7 @@ class Experiment:
     comparisons: Callable[[Any], Sequence[tuple[str, str]]]
     figure: Callable[[dict[str, Any], Path], None]
     degrees_of_freedom: Mapping[str, int] = field(default_factory=dict)
-    document: Mapping[str, Mapping[str, tuple[float, float | None]]] = field(default_factory=dict)
+    document: Callable[[Any], DocumentNumbers] = lambda settings: {}
     further: Callable[[Mapping[str, Mapping[str, Sequence[float]]]], dict[str, Any]] = lambda values: {}
 
 

@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 
 from calibslam_backend.association import ESTIMATED, GIVEN
-from calibslam_backend.estimator import Estimator, EstimatorSettings
-from calibslam_backend.metrics import Trajectory, alignment, ate, position_nees, rpe
+from calibslam_backend.estimator import EstimatorSettings
+from calibslam_backend.metrics import Trajectory, alignment
 from calibslam_backend.noise import CALIBRATED as OWN_COVARIANCE
 from calibslam_backend.noise import FIXED, QUADRICSLAM
 from calibslam_backend.object_map import ObjectMap
@@ -33,6 +33,7 @@ from calibslam_sim.experiments.design import (
     Seed,
 )
 from calibslam_sim.experiments.figures import condition_figure
+from calibslam_sim.experiments.object_slam import accuracy_of_trajectory, estimate
 from calibslam_sim.object_accuracy import object_accuracy
 from calibslam_sim.simulation import Simulation, SimulationSettings, simulate
 
@@ -72,7 +73,7 @@ def run(settings: QuadricSimSettings, condition: str, seed: Seed) -> Metrics:
         )
     )
     back_end = EstimatorSettings(noise_model=model, covariance_scale=scale, association=settings.association)
-    return accuracy(estimate(recording, back_end), recording)
+    return accuracy(estimate(recording.camera, recording.odometry, recording.boxes, back_end), recording)
 
 
 @lru_cache(maxsize=2)
@@ -81,34 +82,19 @@ def recorded(settings: SimulationSettings) -> Simulation:
     return simulate(settings)
 
 
-def estimate(recording: Simulation, settings: EstimatorSettings) -> ObjectMap:
-    """What the back end makes of a recording."""
-    estimator = Estimator(recording.camera, np.eye(4), settings)
-    for k, boxes in enumerate(recording.boxes):
-        if k:
-            estimator.add_motion(recording.odometry[k - 1])
-        estimator.add_boxes(boxes)
-    estimator.finish()
-    return estimator.object_map()
-
-
 def accuracy(result: ObjectMap, recording: Simulation) -> Metrics:
     """Metrics of an estimate against the truth."""
-    estimated = Trajectory(np.array(result.stamps), result.poses)
     truth = Trajectory(recording.times, recording.T_world_camera)
-    T_world_map = alignment(estimated, truth)
+    T_world_map = alignment(Trajectory(np.array(result.stamps), result.poses), truth)
     objects = object_accuracy(
         [Ellipsoid(T_world_map @ quadric.T_map_object, quadric.radii) for quadric in result.quadrics],
         [thing.ellipsoid for thing in recording.world],
     )
-    nees = position_nees(estimated, result.covariances, truth)
     return {
-        "ate_m": ate(estimated, truth),
-        "rpe_m": rpe(estimated, truth),
+        **accuracy_of_trajectory(result, truth),
         "centre_m": objects.centre_m,
         "iou_error": 1.0 - objects.iou,
         "missed": float(objects.true - objects.matched),
-        "nees_position": float("nan") if nees is None else nees,
     }
 
 
@@ -139,7 +125,7 @@ METRICS = {
 EXPERIMENT = Experiment(
     title="Object SLAM of simulated desks under noise models of boxes (Tables 5.2, 5.3)",
     settings=QuadricSimSettings,
-    quick={"duration": 10.0, "frame_rate": 10.0},
+    quick={"duration": 8.0},
     seeds=30,
     quick_seeds=2,
     metrics=METRICS,

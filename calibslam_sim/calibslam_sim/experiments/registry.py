@@ -11,6 +11,7 @@ MODULES = {
     "kalman": "calibslam_sim.experiments.kalman",
     "toy": "calibslam_sim.experiments.toy",
     "quadric_sim": "calibslam_sim.experiments.quadric_sim",
+    "tum": "calibslam_sim.experiments.tum",
 }
 
 

@@ -34,16 +34,17 @@ def paired(a: Sequence[float], b: Sequence[float]) -> dict[str, float | None]:
     """Mean of a - b (negative: a has less error) and the p-values of "no difference".
 
     Repetitions in which one of the two is not defined do not count. None where fewer than two are left; no
-    difference anywhere has p = 1.
+    difference anywhere has p = 1, the same one everywhere p = 0.
     """
     differences = defined(np.asarray(a, float) - np.asarray(b, float))
     if len(differences) < 2:
         return {"mean_difference": None, "p_value": None, "wilcoxon_p_value": None}
     if not differences.any():
         return {"mean_difference": 0.0, "p_value": 1.0, "wilcoxon_p_value": 1.0}
+    spread = float(np.ptp(differences))
     return {
         "mean_difference": float(differences.mean()),
-        "p_value": float(stats.ttest_1samp(differences, 0.0).pvalue),
+        "p_value": float(stats.ttest_1samp(differences, 0.0).pvalue) if spread else 0.0,
         "wilcoxon_p_value": float(stats.wilcoxon(differences).pvalue),
     }
 

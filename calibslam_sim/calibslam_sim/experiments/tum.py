@@ -1,0 +1,197 @@
+"""`tum`: the document's Tables 5.2 and 5.3 on a folder of the TUM benchmark, and the same with real odometry.
+
+Three families of conditions:
+    fixed, quadricslam, calibrated: as in the document, identities given, and each repetition adds its own noise to
+        a good trajectory (there ORB-SLAM's) to make odometry of it;
+    real_given_...: real visual odometry, identities given;
+    real_estimated_...: real visual odometry and nothing else.
+With real odometry each repetition leaves out another tenth of the images: their spread tells how far a result hangs
+on single images, not how it would be on other recordings.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from calibslam_backend.association import ESTIMATED, GIVEN
+from calibslam_backend.estimator import EstimatorSettings
+from calibslam_backend.metrics import NoGroundTruth, Trajectory
+from calibslam_backend.noise import CALIBRATED, FIXED, QUADRICSLAM
+from calibslam_backend.recording import load_calibrator
+from calibslam_msgs_py.bags import BagError
+from calibslam_msgs_py.measurements import Boxes, Camera, RelativeMotion, StampedPose
+from calibslam_msgs_py.settings import setting
+from calibslam_sim.experiments.design import (
+    DocumentNumbers,
+    Experiment,
+    ExperimentError,
+    ExperimentSettings,
+    Metric,
+    Metrics,
+    Seed,
+)
+from calibslam_sim.experiments.figures import condition_figure
+from calibslam_sim.experiments.object_slam import accuracy_of_trajectory, estimate
+from calibslam_sim.odometry_noise import OdometryNoise
+from calibslam_sim.tum_folder import TumError, read_camera, read_detections, read_trajectory
+
+MODELS = (CALIBRATED, FIXED, QUADRICSLAM)
+REAL = {"real_given_": GIVEN, "real_estimated_": ESTIMATED}  # prefix of a condition -> association
+GROUND_TRUTH, ODOMETRY, DETECTIONS, CAMERA_INFO = (
+    "groundtruth.txt",
+    "odometry.txt",
+    "detections.csv",
+    "camera_info.yaml",
+)
+
+
+@dataclass(frozen=True)
+class TumSettings(ExperimentSettings):
+    """The recording, and how its odometry is made."""
+
+    folder: str = setting("", "recording: groundtruth.txt, odometry.txt, detections.csv, camera_info.yaml")
+    calibrator: str = setting("", "file with a calibrator that was fitted on other recordings; empty: the default one")
+    good_trajectory: str = setting("reference_orbslam.txt", "file in the folder of which noisy odometry is made")
+    rotation_noise: float = setting(0.5, "added to each step of it, about each axis", unit="deg", low=1e-4)
+    translation_noise: float = setting(0.01, "added to each step of it, along each axis", unit="m", low=1e-6)
+    left_out: float = setting(0.1, "share of images left out where odometry is real", low=0.0, high=0.9)
+    most_images: int = setting(1_000_000, "of the recording, from its beginning", low=10)
+
+
+@dataclass(frozen=True)
+class TumRecording:
+    """What a folder holds: the boxes have covariances."""
+
+    camera: Camera
+    truth: Trajectory
+    odometry: list[RelativeMotion]
+    good: list[RelativeMotion]
+    images: list[Boxes]
+
+
+def run(settings: TumSettings, condition: str, seed: Seed) -> Metrics:
+    """One condition on one seed."""
+    recording = recorded(settings)
+    rng = np.random.default_rng(seed)
+    family = next((prefix for prefix in REAL if condition.startswith(prefix)), "")
+    model, association = condition.removeprefix(family), REAL.get(family, GIVEN)
+    motions, images = recording.odometry, recording.images
+    if family:
+        kept = rng.random(len(images)) >= settings.left_out
+        images = [boxes for boxes, keep in zip(images, kept, strict=True) if keep]
+    else:
+        noise = OdometryNoise(np.radians(settings.rotation_noise), settings.translation_noise)
+        motions = [
+            RelativeMotion(step.start, step.end, noise.perturb(step.T_start_end, rng), noise.covariance)
+            for step in recording.good
+        ]
+    back_end = EstimatorSettings(noise_model=model, association=association)
+    result = estimate(recording.camera, motions, images, back_end)
+    try:
+        return accuracy_of_trajectory(result, recording.truth)
+    except NoGroundTruth as error:
+        raise ExperimentError(f"{settings.folder}: {error}") from error
+
+
+@lru_cache(maxsize=1)
+def recorded(settings: TumSettings) -> TumRecording:
+    """The recording in a folder; kept for the other conditions.
+
+    Raises:
+        ExperimentError: a file is missing or cannot be read.
+    """
+    folder = Path(settings.folder)
+    if not settings.folder or not folder.is_dir():
+        raise ExperimentError(f"--folder {settings.folder or '(not given)'}: must be a folder in TUM format")
+    try:
+        camera = read_camera(folder / CAMERA_INFO)
+        truth = read_trajectory(folder / GROUND_TRUTH)
+        calibrate = load_calibrator(settings.calibrator or None)
+        images = read_detections(folder / DETECTIONS, camera)[: settings.most_images]
+        return TumRecording(
+            camera,
+            Trajectory(np.array([pose.stamp for pose in truth]), np.stack([pose.T for pose in truth])),
+            steps(read_trajectory(folder / ODOMETRY)),
+            steps(read_trajectory(folder / settings.good_trajectory)),
+            [calibrate(boxes) for boxes in images],
+        )
+    except (TumError, BagError, ValueError, OSError) as error:
+        raise ExperimentError(str(error)) from error
+
+
+def steps(poses: list[StampedPose]) -> list[RelativeMotion]:
+    """Motions between neighbouring poses, of unknown covariance."""
+    return [
+        RelativeMotion(before.stamp, after.stamp, np.linalg.inv(before.T) @ after.T)
+        for before, after in pairwise(poses)
+    ]
+
+
+def conditions(settings: TumSettings) -> list[str]:
+    """Every noise model in every family.
+
+    Raises:
+        ExperimentError: the folder cannot be used.
+    """
+    recorded(settings)  # before any process is started
+    return [prefix + model for prefix in ("", *REAL) for model in MODELS]
+
+
+def comparisons(settings: TumSettings) -> list[tuple[str, str]]:
+    """Calibrated against the baselines."""
+    return [(prefix + CALIBRATED, prefix + model) for prefix in ("", *REAL) for model in MODELS if model != CALIBRATED]
+
+
+def document(settings: dict[str, Any]) -> DocumentNumbers:
+    """Table 5.2 or 5.3, where the folder is of that recording."""
+    name = Path(settings["folder"]).name.replace("freiburg", "fr")
+    for (camera, scene), found in TABLES.items():
+        if camera in name and scene in name:
+            return found
+    return {}
+
+
+def figure(result: dict[str, Any], path: Path) -> None:
+    """Every metric in every condition."""
+    condition_figure(path, EXPERIMENT.title, result, METRICS, list(result["conditions"]))
+
+
+# Words in the name of the folder -> the document's Tables 5.2 and 5.3.
+TABLES: dict[tuple[str, str], DocumentNumbers] = {
+    ("fr3", "office"): {
+        CALIBRATED: {"ate_m": (0.377, 0.081), "rpe_m": (0.033, None)},
+        FIXED: {"ate_m": (0.429, 0.117), "rpe_m": (0.027, 0.0033)},
+        QUADRICSLAM: {"ate_m": (0.484, 0.197), "rpe_m": (0.018, 0.0006)},
+    },
+    ("fr2", "desk"): {
+        CALIBRATED: {"ate_m": (1.394, 0.117), "rpe_m": (0.053, 0.010)},
+        FIXED: {"ate_m": (1.461, 0.071), "rpe_m": (0.042, 0.005)},
+        QUADRICSLAM: {"ate_m": (1.407, 0.160), "rpe_m": (0.033, 0.0005)},
+    },
+}
+
+METRICS = {
+    "ate_m": Metric("ATE", "m"),
+    "rpe_m": Metric("RPE", "m"),
+    "nees_position": Metric("NEES (3 is honest)", is_error=False),
+}
+
+EXPERIMENT = Experiment(
+    title="Object SLAM on a TUM recording under noise models of boxes (Tables 5.2, 5.3)",
+    settings=TumSettings,
+    quick={"most_images": 150},
+    seeds=10,
+    quick_seeds=2,
+    metrics=METRICS,
+    conditions=conditions,
+    run=run,
+    comparisons=comparisons,
+    figure=figure,
+    document=document,
+)

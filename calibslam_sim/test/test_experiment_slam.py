@@ -1,0 +1,137 @@
+"""Experiments that run the back end: `quadric_sim` in simulated worlds, `tum` on a folder in TUM format."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from calibslam_backend.object_map import ObjectMap
+from calibslam_msgs_py.measurements import Array, QuadricEstimate
+from calibslam_sim import experiment
+from calibslam_sim.experiments import quadric_sim, tum
+from calibslam_sim.experiments.design import ExperimentError, repetition_seed
+from calibslam_sim.experiments.object_slam import estimate
+from calibslam_sim.simulation import Simulation, SimulationSettings, simulate
+
+QUICK = quadric_sim.QuadricSimSettings(duration=8.0)
+
+
+@pytest.fixture(scope="module")
+def recording() -> Simulation:
+    return simulate(SimulationSettings(seed=4, duration=8.0))
+
+
+@pytest.fixture(scope="module")
+def folder(recording: Simulation, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The recording in TUM format; its "good trajectory" is the truth."""
+    path = tmp_path_factory.mktemp("tum") / "fr3_office"
+    path.mkdir()
+    measured = [np.eye(4)]
+    for motion in recording.odometry:
+        measured.append(measured[-1] @ motion.T_start_end)
+    for name, poses in {
+        "groundtruth.txt": recording.T_world_camera,
+        "odometry.txt": np.array(measured),
+        "reference_orbslam.txt": recording.T_world_camera,
+    }.items():
+        (path / name).write_text(tum_text(recording.times, poses))
+    rows = ["timestamp,xmin,ymin,xmax,ymax,score,class_id,object_id"]
+    for boxes in recording.boxes:
+        for corners, score, class_id, identity in zip(
+            boxes.corners, boxes.scores, boxes.class_ids, boxes.object_ids, strict=True
+        ):
+            rows.append(",".join([f"{boxes.stamp / 1e9:.9f}", *map(str, corners), str(score), class_id, identity]))
+    (path / "detections.csv").write_text("\n".join(rows) + "\n")
+    K = recording.camera.K.ravel().tolist()
+    (path / "camera_info.yaml").write_text(
+        f"image_width: 640\nimage_height: 480\ncamera_matrix: {{data: {K}}}\n"
+        "distortion_model: plumb_bob\ndistortion_coefficients: {data: [0, 0, 0, 0, 0]}\n"
+    )
+    return path
+
+
+def tum_text(times: Array, poses: Array) -> str:
+    numbers = np.column_stack([poses[:, :3, 3], Rotation.from_matrix(poses[:, :3, :3]).as_quat()])
+    return "".join(
+        f"{time / 1e9:.9f} {' '.join(map(repr, row))}\n" for time, row in zip(times, numbers.tolist(), strict=True)
+    )
+
+
+def test_conditions_of_quadric_sim_share_their_world() -> None:
+    """Conditions differ as they say: the same world, other boxes only with outliers, other noise models."""
+    seed = repetition_seed(0, 0)
+    found = {name: quadric_sim.run(QUICK, name, seed) for name in ("calibrated", "fixed", "outliers_calibrated")}
+    assert quadric_sim.run(QUICK, "calibrated", repetition_seed(0, 0)) == found["calibrated"]
+    assert len({metrics["ate_m"] for metrics in found.values()}) == 3
+    for metrics in found.values():
+        assert 0.0 < metrics["rpe_m"] < 0.05 and 0.0 < metrics["ate_m"] < 0.3
+        assert 0.0 <= metrics["iou_error"] <= 1.0 and 0 <= metrics["missed"] <= 19
+
+
+def test_quadric_sims_accuracy_of_the_truth_is_perfect(recording: Simulation) -> None:
+    # The truth, seen from its first camera.
+    T_map_world = np.linalg.inv(recording.T_world_camera[0])
+    quadrics = tuple(
+        QuadricEstimate(
+            thing.id, thing.class_id, T_map_world @ thing.ellipsoid.T_world_object, thing.ellipsoid.radii, np.eye(9), 9
+        )
+        for thing in recording.world
+    )
+    poses = T_map_world @ recording.T_world_camera
+    covariances = np.tile(np.eye(6), (len(poses), 1, 1))
+    result = ObjectMap(tuple(int(t) for t in recording.times), poses, covariances, quadrics, "camera")
+    found = quadric_sim.accuracy(result, recording)
+    for name in ("ate_m", "rpe_m", "centre_m", "nees_position", "missed"):
+        assert found[name] == pytest.approx(0.0, abs=1e-6), name
+    assert found["iou_error"] == pytest.approx(0.0, abs=1e-3)
+
+
+def test_tum_sees_what_the_folder_holds(folder: Path, recording: Simulation) -> None:
+    found = tum.recorded(tum.TumSettings(folder=str(folder)))
+    assert len(found.good) == len(found.odometry) == len(recording.odometry)
+    np.testing.assert_allclose(found.odometry[7].T_start_end, recording.odometry[7].T_start_end, atol=1e-6)
+    assert all(boxes.has_covariance.all() for boxes in found.images)
+
+
+def test_tum_command(folder: Path, tmp_path: Path) -> None:
+    arguments = ["tum", "--quick", "--folder", str(folder), "--seeds", "1", "--jobs", "1", "--out", str(tmp_path)]
+    assert experiment.main(arguments) == 0
+    result = json.loads((tmp_path / "result.json").read_text())
+    assert {"calibrated", "fixed", "quadricslam", "real_given_fixed", "real_estimated_calibrated"} <= set(
+        result["conditions"]
+    )
+    for metrics in result["conditions"].values():
+        assert 0.0 < metrics["ate_m"]["mean"] < 0.5
+    assert tum.document(result["settings"])["fixed"]["ate_m"] == (0.429, 0.117)
+    assert tum.document({"folder": "somewhere/fr1_desk"}) == {}
+
+
+def test_tum_noise_has_its_size(folder: Path) -> None:
+    """With almost no noise the estimate is almost the truth; with the document's it is not."""
+    small = tum.TumSettings(folder=str(folder), rotation_noise=1e-4, translation_noise=1e-6)
+    large = tum.TumSettings(folder=str(folder))
+    exact, noisy = (tum.run(settings, "fixed", repetition_seed(0, 0)) for settings in (small, large))
+    assert exact["ate_m"] < 1e-3 < noisy["ate_m"]
+
+
+def test_tum_says_what_is_missing(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = ["--out", str(tmp_path / "out"), "--jobs", "1"]
+    assert experiment.main(["tum", *out]) == 1
+    assert "--folder (not given)" in capsys.readouterr().err
+    assert experiment.main(["tum", "--folder", str(folder), "--good-trajectory", "no.txt", *out]) == 1
+    assert "no.txt" in capsys.readouterr().err
+    with pytest.raises(ExperimentError, match=r"nothing\.json"):
+        tum.recorded(tum.TumSettings(folder=str(folder), calibrator="nothing.json"))
+
+
+def test_measurements_reach_the_back_end_in_order_of_time(recording: Simulation) -> None:
+    """Also where they are given out of order."""
+    settings = quadric_sim.EstimatorSettings(association="given")
+    motions, images = recording.odometry[:60], recording.boxes[:60]
+    a = estimate(recording.camera, motions, images, settings)
+    b = estimate(recording.camera, motions, images[::-1], settings)
+    np.testing.assert_array_equal(a.poses, b.poses)
