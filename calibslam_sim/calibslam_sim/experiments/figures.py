@@ -16,7 +16,7 @@ from calibslam_sim.experiments.statistics import defined, half_interval
 matplotlib.use("Agg")
 from matplotlib import pyplot as plt
 from matplotlib.axes import Axes
-from matplotlib.ticker import FixedLocator, NullLocator
+from matplotlib.ticker import FixedLocator, FuncFormatter, LogLocator, NullLocator
 
 STYLES = ("o-", "s--", "^:", "D-.")
 COLOURS = ("tab:blue", "tab:orange", "tab:green", "tab:purple")
@@ -64,8 +64,11 @@ def scale_figure(
         panel.xaxis.set_major_locator(FixedLocator(factors))
         panel.xaxis.set_minor_locator(NullLocator())
         panel.set_xticklabels([f"{factor:g}" if factor >= 1 else f"1/{1 / factor:g}" for factor in factors])
+        panel.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+        panel.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+        panel.yaxis.set_minor_locator(NullLocator())
         panel.set(xlabel="believed over true standard deviation", ylabel=named.label)
-        panel.grid(alpha=0.3, which="both")
+        panel.grid(alpha=0.3)
         panel.legend(fontsize=8)
     for panel in axes.flat[len(metrics) :]:
         panel.set_axis_off()

@@ -125,34 +125,39 @@ class Problem:
     initial: gtsam.Values
 
 
-def problem(
-    world: World, settings: ToySettings, odometry_scale: float, believed_factors: Array, true_factors: Array
-) -> Problem:
-    """The factor graph of a repetition (eq. 2.2.4), initialised as in section 5.1.2.
+@dataclass(frozen=True)
+class Noise:
+    """What the noise is, and what a graph believes, as factors on the standard deviations of `ToySettings`.
 
-    Args:
-        world: the repetition.
-        settings: its standard deviations.
-        odometry_scale: the graph believes odometry's standard deviations times this.
-        believed_factors: (M,) the graph believes those of measurements times these.
-        true_factors: (M,) what they really are multiplied by.
+    Attributes:
+        odometry: believed.
+        believed: (M,) of each measurement.
+        true: (M,) of each measurement.
     """
+
+    odometry: float
+    believed: Array
+    true: Array
+
+
+def problem(world: World, settings: ToySettings, noise: Noise) -> Problem:
+    """The factor graph of a repetition (eq. 2.2.4), initialised as in section 5.1.2."""
     diagonal = gtsam.noiseModel.Diagonal.Sigmas
     graph, initial = gtsam.NonlinearFactorGraph(), gtsam.Values()
     graph.add(gtsam.PriorFactorPose2(0, world.poses[0], diagonal(PRIOR_SIGMAS)))
     guesses = [world.poses[0]]
     initial.insert(0, guesses[0])
-    step_noise = diagonal(odometry_scale * settings.odometry_sigmas)
-    for k, noise in enumerate(world.odometry_noise):
-        error = gtsam.Pose2.Expmap(noise * settings.odometry_sigmas)
+    step_noise = diagonal(noise.odometry * settings.odometry_sigmas)
+    for k, unit in enumerate(world.odometry_noise):
+        error = gtsam.Pose2.Expmap(unit * settings.odometry_sigmas)
         measured = world.poses[k].between(world.poses[k + 1]).compose(error)
         graph.add(gtsam.BetweenFactorPose2(k, k + 1, measured, step_noise))
         guesses.append(guesses[-1].compose(measured))
         initial.insert(k + 1, guesses[-1])
     sigmas = settings.measurement_sigmas
-    errors = world.measurement_noise * true_factors[:, None] * sigmas
+    errors = world.measurement_noise * noise.true[:, None] * sigmas
     for (k, j), bearing, distance, believed in zip(
-        world.seen.tolist(), world.bearings + errors[:, 0], world.ranges + errors[:, 1], believed_factors, strict=True
+        world.seen.tolist(), world.bearings + errors[:, 0], world.ranges + errors[:, 1], noise.believed, strict=True
     ):
         key = FIRST_LANDMARK + j
         noise_model = diagonal(believed * sigmas)
@@ -163,10 +168,10 @@ def problem(
     return Problem(graph, initial)
 
 
-def solve(posed: Problem) -> gtsam.Values:
-    """Levenberg-Marquardt, to its end: GTSAM's usual tolerance of 1e-5 stops one run in six too early here."""
+def solve(graph: gtsam.NonlinearFactorGraph, initial: gtsam.Values, tolerance: float = 1e-10) -> gtsam.Values:
+    """Levenberg-Marquardt; GTSAM's usual tolerance of 1e-5 stops one run in six too early here."""
     parameters = gtsam.LevenbergMarquardtParams()
-    parameters.setRelativeErrorTol(1e-10)
-    parameters.setAbsoluteErrorTol(1e-10)
+    parameters.setRelativeErrorTol(tolerance)
+    parameters.setAbsoluteErrorTol(tolerance)
     parameters.setMaxIterations(300)
-    return gtsam.LevenbergMarquardtOptimizer(posed.graph, posed.initial, parameters).optimize()
+    return gtsam.LevenbergMarquardtOptimizer(graph, initial, parameters).optimize()
