@@ -105,7 +105,12 @@ def kalman_filter(model: Model, measurements: Array) -> tuple[Array, Array]:
 
 
 def factor_graph(model: Model, measurements: Array) -> tuple[Array, Array]:
-    """The same states and covariances, each as the last variable of the graph of all measurements up to it."""
+    """The same states and covariances, each as the last variable of the graph of all measurements up to it.
+
+    Variables are differences to what was measured, at rest, so that they are small: elimination by Cholesky
+    rounds in proportion to them.
+    """
+    origins = np.vstack([np.zeros(DIMENSION), measurements @ model.H])
     whiten_Q, whiten_R, whiten_P = (np.linalg.inv(np.linalg.cholesky(C)) for C in (model.Q, model.R, model.P))
     graph = gtsam.GaussianFactorGraph()
     unit = gtsam.noiseModel.Unit.Create
@@ -115,12 +120,13 @@ def factor_graph(model: Model, measurements: Array) -> tuple[Array, Array]:
     ordering.push_back(0)
     states, covariances = [], []
     for t, z in enumerate(measurements, 1):
-        graph.add(t - 1, -whiten_Q @ model.F, t, whiten_Q, np.zeros(DIMENSION), unit(DIMENSION))
-        graph.add(t, whiten_R @ model.H, whiten_R @ z, unit(2))
+        predicted = model.F @ origins[t - 1]
+        graph.add(t - 1, -whiten_Q @ model.F, t, whiten_Q, whiten_Q @ (predicted - origins[t]), unit(DIMENSION))
+        graph.add(t, whiten_R @ model.H, whiten_R @ (z - model.H @ origins[t]), unit(2))
         ordering.push_back(t)
         conditional = graph.eliminateSequential(ordering).at(t)
         R = conditional.R()
-        states.append(np.linalg.solve(R, conditional.d()))
+        states.append(origins[t] + np.linalg.solve(R, conditional.d()))
         covariances.append(np.linalg.inv(R.T @ R))
     return np.array(states), np.array(covariances)
 
