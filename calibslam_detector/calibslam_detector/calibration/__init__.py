@@ -1,0 +1,1 @@
+"""Covariances that mean what they say: losses, recalibration, metrics. docs/calibration.md derives them."""
