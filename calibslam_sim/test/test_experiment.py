@@ -88,8 +88,11 @@ def test_half_interval() -> None:
 
 def test_numbers_in_tables() -> None:
     assert mean_and_deviation(0.98765, 0.356) == "0.988 ± 0.36"
+    assert mean_and_deviation(1223.0, 5512.0) == "1220 ± 5500"
+    assert mean_and_deviation(0.0909, 2.1e-13) == "0.0909 ± 2.1e-13"
+    assert mean_and_deviation(3.0, None) == "3"
     assert mean_and_deviation(None, None) == "-"
-    assert (p_value(0.012), p_value(3.2e-7)) == ("0.012", "3e-07")
+    assert (p_value(0.012), p_value(3.2e-7), p_value(1e-40)) == ("0.012", "3e-07", "<1e-16")
 
 
 # -- the command ------------------------------------------------------------------------------------------------------

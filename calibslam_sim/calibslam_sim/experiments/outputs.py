@@ -9,6 +9,8 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from calibslam_sim.experiments.design import Experiment, ExperimentSettings, Metric
 from calibslam_sim.experiments.statistics import nees_interval, paired, summary
 
@@ -98,19 +100,30 @@ def rows_of_pairs(result: dict[str, Any], metrics: Mapping[str, Metric]) -> list
 
 
 def mean_and_deviation(mean: float | None, std: float | None) -> str:
-    """E.g. "0.988 ± 0.356"; "-" where there is none."""
+    """E.g. "0.988 ± 0.36"; "-" where there is none."""
     if mean is None:
         return "-"
-    return f"{mean:.3g}" if std is None else f"{mean:.3g} ± {std:.2g}"
+    return significant(mean, 3) if std is None else f"{significant(mean, 3)} ± {significant(std, 2)}"
+
+
+def significant(value: float, digits: int) -> str:
+    """So many digits that count; with an exponent only where many zeros would precede them."""
+    if abs(value) < 1e-3:
+        return f"{value:.{digits}g}"
+    return str(np.format_float_positional(value, precision=digits, unique=False, fractional=False, trim="-"))
 
 
 def _difference(found: dict[str, float | None]) -> str:
     mean, p = found["mean_difference"], found["p_value"]
-    return "-" if mean is None or p is None else f"{mean:+.2g} ({p_value(p)})"
+    if mean is None or p is None:
+        return "-"
+    return f"{'+' if mean > 0.0 else ''}{significant(mean, 2)} ({p_value(p)})"
 
 
 def p_value(p: float) -> str:
-    """Two digits; below 1e-4 its order of magnitude."""
+    """Two digits; below 1e-4 its order of magnitude, which means nothing below 1e-16."""
+    if p < 1e-16:
+        return "<1e-16"
     return f"{p:.2g}" if p >= 1e-4 else f"{p:.0e}"
 
 
