@@ -51,25 +51,29 @@ def perform(
     return result
 
 
-def _parser(argv: Sequence[str] | None) -> tuple[argparse.ArgumentParser, Experiment]:
-    """A parser with the options of the experiment that the arguments name, and this experiment."""
-    first = argparse.ArgumentParser(prog="experiment", add_help=False)
-    first.add_argument("name", choices=sorted(MODULES), metavar="NAME", help=" | ".join(sorted(MODULES)))
-    first.add_argument("--quick", action="store_true", help="reduced sizes: whether it runs, not what is true")
+def _name(arguments: Sequence[str]) -> str:
+    """The experiment that the first argument names."""
     parser = argparse.ArgumentParser(
         prog="experiment",
+        usage="experiment NAME --out DIR [--quick] [options]",
         description=__doc__,
-        parents=[first],
         formatter_class=argparse.RawDescriptionHelpFormatter,
         epilog="experiment NAME --help tells the options of one experiment.",
     )
-    arguments = sys.argv[1:] if argv is None else list(argv)
-    if not any(word in MODULES for word in arguments):
-        parser.parse_args(arguments)  # shows help or says what is wrong
-    chosen = first.parse_known_args([word for word in arguments if word not in ("-h", "--help")])[0]
-    experiment = load(chosen.name)
-    repetitions = experiment.quick_seeds if chosen.quick else experiment.seeds
+    parser.add_argument("name", choices=sorted(MODULES), metavar="NAME", help=", ".join(sorted(MODULES)))
+    return str(parser.parse_args(arguments[:1]).name)
+
+
+def _parser(name: str, experiment: Experiment, is_quick: bool) -> argparse.ArgumentParser:
+    """The options of an experiment, with its defaults or the quick ones."""
+    parser = argparse.ArgumentParser(
+        prog=f"experiment {name}",
+        description=f"{experiment.title}\n\n{__doc__}",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    repetitions = experiment.quick_seeds if is_quick else experiment.seeds
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder of the result")
+    parser.add_argument("--quick", action="store_true", help="reduced sizes: whether it runs, not what is true")
     parser.add_argument("--seeds", type=_positive, default=repetitions, help="repetitions (default: %(default)s)")
     parser.add_argument("--jobs", type=int, default=-1, help="processes (default: one for each core)")
     parser.add_argument(
@@ -81,11 +85,10 @@ def _parser(argv: Sequence[str] | None) -> tuple[argparse.ArgumentParser, Experi
     parser.add_argument(
         "--overwrite", action="store_true", help="begin anew in a folder that is in use, as after a change of code"
     )
-    parser.description = f"{chosen.name}: {experiment.title}\n\n{__doc__}"
     add_arguments(parser, experiment.settings)
-    if chosen.quick:
+    if is_quick:
         parser.set_defaults(**experiment.quick)
-    return parser, experiment
+    return parser
 
 
 def _positive(text: str) -> int:
@@ -97,14 +100,15 @@ def _positive(text: str) -> int:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Command line of `experiment`; returns the exit code."""
-    parser, experiment = _parser(argv)
-    arguments = parser.parse_args(argv)
     words = sys.argv[1:] if argv is None else list(argv)
+    name = _name(words)
+    experiment = load(name)
+    arguments = _parser(name, experiment, "--quick" in words).parse_args(words[1:])
     command = shlex.join(["./calibslam", "run", "calibslam_sim", "experiment", *words])
     try:
         settings = from_arguments(arguments, experiment.settings)
         result = perform(
-            arguments.name,
+            name,
             settings,
             arguments.out,
             arguments.seeds,
@@ -120,7 +124,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(f"experiment: {error}", file=sys.stderr)
         return 1
     print(f"{experiment.title}\n\n{table(result, experiment.metrics)}\n")
-    print(f"{arguments.out}/: result.json, result.csv, {arguments.name}.png")
+    print(f"{arguments.out}/: result.json, result.csv, {name}.png")
     return 0
 
 
