@@ -1,0 +1,75 @@
+"""The two regressions: what is drawn, that training repeats itself, and that f-Cal is better calibrated."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+import torch
+
+from calibslam_detector.regressions.methods import METHODS, RegressionSettings, run
+from calibslam_detector.regressions.tasks import BLURS, LABEL_SIGMA_PER_BLUR, SIDE, TASKS, UNIT, bokeh, curve
+
+SMALL = RegressionSettings(degrees=20, sums=50, batch=60, steps=20, size=0.1, effort=0.1)
+
+
+@pytest.fixture(autouse=True, scope="module")
+def one_thread() -> Iterator[None]:
+    """For small tensors more threads only wait for each other."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(threads)
+
+
+def test_curve_has_the_noise_it_says() -> None:
+    samples = curve(20000, torch.Generator().manual_seed(0))
+    x = samples.x
+    mean = torch.sin(torch.pi * x) + 0.5 * torch.sin(7.0 * torch.pi * x) + 0.3 * torch.cos(12.0 * torch.pi * x)
+    z = (samples.y - mean) / samples.sigma
+    # The variance of a mean of 20000 squared normals is 2/20000.
+    assert float(z.square().mean()) == pytest.approx(1.0, abs=4.0 * math.sqrt(2.0 / 20000))
+    assert float(samples.sigma.min()) >= 0.05 and float(samples.sigma.max()) <= 0.5
+
+
+def test_bokeh_shows_its_noise() -> None:
+    """The disc is where the label says; a picture with more blur is darker and its label worse."""
+    samples = bokeh(4000, torch.Generator().manual_seed(0))
+    assert samples.x.shape == (4000, 1, SIDE, SIDE) and samples.y.shape == (4000, 2)
+    sigma_px = samples.sigma * UNIT
+    assert float(sigma_px.min()) >= LABEL_SIGMA_PER_BLUR * BLURS[0] - 1e-6
+    assert float(sigma_px.max()) <= LABEL_SIGMA_PER_BLUR * BLURS[1] + 1e-6
+    peaks = samples.x.flatten(1).max(dim=1)
+    assert float(torch.corrcoef(torch.stack([peaks.values, samples.sigma[:, 0]]))[0, 1]) < -0.8
+    sharp = samples.sigma[:, 0] < 0.06
+    column, row = peaks.indices[sharp] % SIDE + 0.5, peaks.indices[sharp] // SIDE + 0.5
+    label = samples.y[sharp] * UNIT + SIDE / 2.0
+    assert float(torch.hypot(label[:, 0] - column, label[:, 1] - row).median()) < 1.5
+
+
+@pytest.mark.parametrize("method", list(METHODS))
+def test_every_method_runs(method: str) -> None:
+    result = run("curve", method, SMALL, seed=1)
+    assert 0.0 <= result["ece_z"] <= 0.5 and 0.0 <= result["ece_q"] <= 0.5
+    assert math.isnan(result["nll"]) == (method == "isotonic")
+
+
+def test_same_seed_same_numbers() -> None:
+    assert run("bokeh", "f_cal_kl", SMALL, 3) == run("bokeh", "f_cal_kl", SMALL, 3)
+
+
+@pytest.mark.parametrize("task", list(TASKS))
+def test_f_cal_is_better_calibrated_than_likelihood(task: str) -> None:
+    """Two seeds: ECE(z) and ECE(q) at most 0.7 and 0.4 of the likelihood's, the same mean.
+
+    The full comparison is the experiment `fcal`.
+    """
+    settings = RegressionSettings()
+    results = {m: [run(task, m, settings, seed) for seed in range(2)] for m in ("nll", "f_cal_kl")}
+    mean = {m: {name: np.mean([r[name] for r in found]) for name in found[0]} for m, found in results.items()}
+    assert mean["f_cal_kl"]["ece_z"] < 0.7 * mean["nll"]["ece_z"]
+    assert mean["f_cal_kl"]["ece_q"] < 0.4 * mean["nll"]["ece_q"]
+    assert mean["f_cal_kl"]["rmse"] == pytest.approx(mean["nll"]["rmse"])
+    assert mean["f_cal_kl"]["nll"] < mean["nll"]["nll"]
