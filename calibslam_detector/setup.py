@@ -20,7 +20,12 @@ setup(
     description="Boxes with calibrated covariances: a calibrator for the boxes of any detector.",
     license="Apache-2.0",
     entry_points={
-        "console_scripts": [f"calibrator = {PACKAGE}.calibrator_node:main"],
+        "console_scripts": [
+            f"calibrator = {PACKAGE}.calibrator_node:main",
+            f"detector = {PACKAGE}.detector_node:main",
+            f"evaluate_detector = {PACKAGE}.evaluate_detector:main",
+            f"train = {PACKAGE}.train:main",
+        ],
         "calibslam.calibrators": [f"default = {PACKAGE}.calibrator:load"],
     },
 )

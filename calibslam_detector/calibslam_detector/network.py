@@ -16,15 +16,21 @@ from torchvision.models.detection import (
     fasterrcnn_mobilenet_v3_large_320_fpn,
     fasterrcnn_resnet50_fpn_v2,
 )
-from torchvision.models.detection.backbone_utils import resnet_fpn_backbone
+from torchvision.models.detection.anchor_utils import AnchorGenerator
+from torchvision.models.detection.backbone_utils import BackboneWithFPN, resnet_fpn_backbone
 from torchvision.models.detection.faster_rcnn import FastRCNNPredictor, TwoMLPHead
+from torchvision.models.mobilenetv3 import mobilenet_v3_large
 from torchvision.ops import batched_nms, clip_boxes_to_image, remove_small_boxes
 from torchvision.ops.misc import FrozenBatchNorm2d
 
 from calibslam_detector.box_covariance import corner_covariances, rescaled
 from calibslam_detector.covariance_head import CovarianceHead, geometry
 
-COMPACT_FEATURES = 256  # of a region, a quarter of torchvision's: 8 instead of 19 million weights
+# The compact network: a quarter of torchvision's MobileNet detector, and finer levels for small things.
+COMPACT_CHANNELS, COMPACT_FEATURES = 128, 256  # of a level, of a region
+COMPACT_STAGES = (4, 7, 16)  # of MobileNet v3 large: strides 8, 16, 32
+COMPACT_ANCHORS = ((24,), (48,), (112,), (224,))  # [px of an input 320 high], for these levels and a coarser one
+COMPACT_REGIONS = 96  # learnt from per image
 
 
 def _mobilenet(classes: int) -> FasterRCNN:
@@ -32,12 +38,27 @@ def _mobilenet(classes: int) -> FasterRCNN:
 
 
 def _compact(classes: int) -> FasterRCNN:
-    detector = _mobilenet(classes)
-    pool = detector.roi_heads.box_roi_pool
-    inputs = detector.backbone.out_channels * pool.output_size[0] * pool.output_size[1]
-    detector.roi_heads.box_head = TwoMLPHead(inputs, COMPACT_FEATURES)
-    detector.roi_heads.box_predictor = FastRCNNPredictor(COMPACT_FEATURES, classes)
-    return detector
+    stages = mobilenet_v3_large(weights=None, norm_layer=nn.BatchNorm2d).features
+    backbone = BackboneWithFPN(
+        stages,
+        return_layers={str(stage): str(level) for level, stage in enumerate(COMPACT_STAGES)},
+        in_channels_list=[stages[stage].out_channels for stage in COMPACT_STAGES],
+        out_channels=COMPACT_CHANNELS,
+        norm_layer=nn.BatchNorm2d,
+    )
+    return FasterRCNN(
+        backbone,
+        min_size=320,
+        max_size=640,
+        rpn_anchor_generator=AnchorGenerator(COMPACT_ANCHORS, ((0.5, 1.0, 2.0),) * len(COMPACT_ANCHORS)),
+        rpn_pre_nms_top_n_train=400,
+        rpn_post_nms_top_n_train=200,
+        rpn_pre_nms_top_n_test=150,
+        rpn_post_nms_top_n_test=100,
+        box_head=TwoMLPHead(COMPACT_CHANNELS * 7 * 7, COMPACT_FEATURES),
+        box_predictor=FastRCNNPredictor(COMPACT_FEATURES, classes),
+        box_batch_size_per_image=COMPACT_REGIONS,
+    )
 
 
 def _resnet50(classes: int) -> FasterRCNN:

@@ -182,9 +182,9 @@ def _shadow(p, centres, whitening, lamps):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True)
-def shade(
+def shade(  # type: ignore[no-untyped-def]
     K, T_world_camera, ids, depths, centres, whitening, patterns, numbers, colours, surfaces, lattice, light, out
-):  # type: ignore[no-untyped-def]
+):
     """Linear light (H, W, 3) float32 that comes from what each pixel sees, written to `out`.
 
     Args:

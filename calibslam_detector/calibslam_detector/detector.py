@@ -1,0 +1,84 @@
+"""An image in, boxes with covariances out."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from calibslam_detector import weights_file
+from calibslam_detector.coco_data import to_tensor
+from calibslam_detector.network import CalibratedDetector
+from calibslam_msgs_py.covariance import symmetric
+from calibslam_msgs_py.measurements import Boxes
+from calibslam_msgs_py.settings import Settings, setting
+
+DEVICES = ("auto", "cpu", "cuda")
+
+
+class DeviceError(ValueError):
+    """A device that is not there."""
+
+
+@dataclass(frozen=True)
+class DetectorSettings(Settings):
+    """What is detected, and where that is computed."""
+
+    score_threshold: float = setting(0.5, "boxes of a smaller score are left out", low=0.0, high=1.0)
+    device: str = setting("auto", "auto: CUDA where it is, else CPU", choices=DEVICES)
+    threads: int = setting(0, "of the CPU; 0: as many as torch takes", low=0)
+
+
+class Detector:
+    """Detects with a network.
+
+    Args:
+        model: the network.
+        settings: what is detected, and where.
+
+    Raises:
+        DeviceError: there is no CUDA.
+    """
+
+    def __init__(self, model: CalibratedDetector, settings: DetectorSettings) -> None:
+        self.device = _device(settings.device)
+        if settings.threads:
+            torch.set_num_threads(settings.threads)
+        self.class_names = model.class_names
+        self._model = model.to(self.device).eval()
+        self._model.detector.roi_heads.score_thresh = settings.score_threshold
+
+    @classmethod
+    def from_file(cls, path: Path, settings: DetectorSettings) -> Detector:
+        """With the weights of a file.
+
+        Raises:
+            WeightsError: they cannot be used.
+            DeviceError: there is no CUDA.
+        """
+        return cls(weights_file.load(path), settings)
+
+    def __call__(self, image: np.ndarray, stamp: int = 0, frame_id: str = "camera") -> Boxes:
+        """Boxes, the best first, of an image (H, W, 3) uint8 RGB that was taken at `stamp` [ns]."""
+        with torch.inference_mode():
+            (found,) = self._model.detect([to_tensor(image).to(self.device)])
+        covariances = found["covariances"].double().cpu().numpy()
+        return Boxes(
+            stamp=stamp,
+            width=image.shape[1],
+            height=image.shape[0],
+            corners=found["boxes"].double().cpu().numpy(),
+            covariances=symmetric(covariances),
+            class_ids=tuple(self.class_names[int(label) - 1] for label in found["labels"]),
+            scores=found["scores"].double().cpu().numpy(),
+            object_ids=("",) * len(covariances),
+            frame_id=frame_id,
+        )
+
+
+def _device(name: str) -> torch.device:
+    if name == "cuda" and not torch.cuda.is_available():
+        raise DeviceError("there is no CUDA device that torch can use; set device to auto or cpu")
+    return torch.device("cuda" if name == "cuda" or (name == "auto" and torch.cuda.is_available()) else "cpu")

@@ -1,0 +1,147 @@
+"""Node `detector`: images in, boxes with covariances out.
+
+The executor's thread keeps the newest image only; one worker thread detects. Images that a newer one replaces before
+it is their turn are counted as dropped: a late box is worth less than a new one.
+"""
+
+from __future__ import annotations
+
+import sys
+import threading
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from calibslam_msgs.msg import BoundingBoxArray
+from rclpy.node import Node
+from sensor_msgs.msg import CompressedImage, Image
+
+from calibslam_detector.detector import Detector, DetectorSettings, DeviceError
+from calibslam_detector.image_conversion import decode_compressed, decode_raw, encode_jpeg
+from calibslam_detector.overlay import draw_overlay
+from calibslam_detector.weights_file import WeightsError
+from calibslam_msgs_py.conversions import RosTypes, boxes_to_msg, header_to_msg, stamp_from_msg, valid_boxes
+from calibslam_msgs_py.measurements import InvalidMeasurement
+from calibslam_msgs_py.node import MEASUREMENT, SENSOR, Counters, run
+from calibslam_msgs_py.settings import Settings, SettingsError, declare_parameters, setting
+
+SECONDS_BETWEEN_WARNINGS = 5.0
+OVERLAY_QUALITY = 85  # of JPEG
+
+
+@dataclass(frozen=True)
+class DetectorNodeSettings(Settings):
+    """Parameters of the node beside those of the detector."""
+
+    weights: str = setting("", "file that `train` wrote")
+
+
+@dataclass(frozen=True)
+class Waiting:
+    """An image that came: how to decode it, stamp [ns], frame."""
+
+    decode: Callable[[], np.ndarray]
+    stamp: int
+    frame_id: str
+
+
+class DetectorNode(Node):
+    """camera/image_raw or camera/image_raw/compressed -> detections, ~/overlay/compressed."""
+
+    def __init__(self) -> None:
+        super().__init__("detector")
+        settings = declare_parameters(self, DetectorNodeSettings)
+        detector_settings = declare_parameters(self, DetectorSettings)
+        if not settings.weights:
+            raise SettingsError("weights: name the file of a trained detector, e.g. -p weights:=RUN/weights.pt")
+        try:
+            self._detector = Detector.from_file(Path(settings.weights), detector_settings)
+        except (WeightsError, DeviceError) as error:
+            raise SettingsError(str(error)) from error
+        self._detector(np.zeros((480, 640, 3), np.uint8))  # the first image takes longer; no camera shall wait for it
+        self._types = RosTypes()
+        self._counters = Counters(self)
+        self._counters.set("device", self._detector.device)
+        self._boxes = self.create_publisher(BoundingBoxArray, "detections", MEASUREMENT)
+        self._overlay = self.create_publisher(CompressedImage, "~/overlay/compressed", SENSOR)
+        self._newest: Waiting | None = None
+        self._arrived = threading.Condition()
+        self._stop = False
+        self._worker = threading.Thread(target=self._work, name="detector", daemon=True)
+        self._worker.start()
+        self.create_subscription(Image, "camera/image_raw", self._receive_raw, SENSOR)
+        self.create_subscription(CompressedImage, "camera/image_raw/compressed", self._receive_compressed, SENSOR)
+        self.get_logger().info(f"detecting {', '.join(self._detector.class_names)} on {self._detector.device}")
+
+    # -- executor's thread --------------------------------------------------------------------------------------
+
+    def _receive_raw(self, message: Any) -> None:
+        self._put(
+            message.header,
+            lambda: decode_raw(
+                np.frombuffer(message.data, np.uint8), message.height, message.width, message.step, message.encoding
+            ),
+        )
+
+    def _receive_compressed(self, message: Any) -> None:
+        self._put(message.header, lambda: decode_compressed(np.frombuffer(message.data, np.uint8)))
+
+    def _put(self, header: Any, decode: Callable[[], np.ndarray]) -> None:
+        with self._arrived:
+            if self._newest is not None:
+                self._counters.count("dropped")
+            self._newest = Waiting(decode, stamp_from_msg(header.stamp), str(header.frame_id))
+            self._arrived.notify()
+
+    # -- worker's thread ----------------------------------------------------------------------------------------
+
+    def _work(self) -> None:
+        while True:
+            with self._arrived:
+                self._arrived.wait_for(lambda: self._newest is not None or self._stop)
+                waiting, self._newest = self._newest, None
+            if self._stop or waiting is None:
+                return
+            try:
+                self._detect(waiting)
+            except InvalidMeasurement as error:
+                self._counters.count(f"rejected_{error.reason}")
+                self.get_logger().warning(f"left out: {error}", throttle_duration_sec=SECONDS_BETWEEN_WARNINGS)
+            except Exception as error:  # the node goes on with the next image
+                self._counters.count("errors")
+                self.get_logger().error(f"{type(error).__name__}: {error}")
+
+    def _detect(self, waiting: Waiting) -> None:
+        start = time.monotonic()
+        image = waiting.decode()
+        boxes, rejected = valid_boxes(self._detector(image, waiting.stamp, waiting.frame_id))
+        for reason, count in rejected.items():
+            self._counters.count(f"rejected_box_{reason}", count)
+        self._boxes.publish(boxes_to_msg(boxes, self._types))
+        self._counters.count("images")
+        self._counters.count("boxes", len(boxes))
+        self._counters.set("detection_ms", f"{(time.monotonic() - start) * 1e3:.0f}")
+        if self._overlay.get_subscription_count():
+            drawn = draw_overlay(image[..., ::-1], boxes)
+            data = self._types.octets(encode_jpeg(drawn, OVERLAY_QUALITY))
+            header = header_to_msg(waiting.stamp, waiting.frame_id, self._types)
+            self._overlay.publish(CompressedImage(header=header, format="jpeg", data=data))
+
+    def close(self) -> None:
+        """Let the worker end its image."""
+        with self._arrived:
+            self._stop = True
+            self._arrived.notify()
+        self._worker.join(timeout=10.0)
+
+
+def main(args: Sequence[str] | None = None) -> int:
+    """Runs the node; returns the exit code."""
+    return run(DetectorNode, args)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

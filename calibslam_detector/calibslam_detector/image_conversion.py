@@ -1,0 +1,66 @@
+"""Images as cameras publish them -> RGB, whatever the encoding; without ROS."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+
+from calibslam_msgs_py.measurements import InvalidMeasurement
+
+# Encodings of sensor_msgs/Image with 8 bits per channel: channels, and how OpenCV makes RGB of them.
+ENCODINGS: dict[str, tuple[int, int | None]] = {
+    "rgb8": (3, None),
+    "bgr8": (3, cv2.COLOR_BGR2RGB),
+    "rgba8": (4, cv2.COLOR_RGBA2RGB),
+    "bgra8": (4, cv2.COLOR_BGRA2RGB),
+    "mono8": (1, cv2.COLOR_GRAY2RGB),
+    "8UC3": (3, cv2.COLOR_BGR2RGB),
+    "8UC1": (1, cv2.COLOR_GRAY2RGB),
+    "bayer_rggb8": (1, cv2.COLOR_BayerRGGB2RGB),
+    "bayer_bggr8": (1, cv2.COLOR_BayerBGGR2RGB),
+    "bayer_gbrg8": (1, cv2.COLOR_BayerGBRG2RGB),
+    "bayer_grbg8": (1, cv2.COLOR_BayerGRBG2RGB),
+    "yuv422": (2, cv2.COLOR_YUV2RGB_UYVY),
+    "yuv422_yuy2": (2, cv2.COLOR_YUV2RGB_YUY2),
+}
+
+
+def decode_raw(data: np.ndarray, height: int, width: int, step: int, encoding: str) -> np.ndarray:
+    """(H, W, 3) uint8 RGB of the bytes of a sensor_msgs/Image.
+
+    Raises:
+        InvalidMeasurement: an encoding that is not of 8-bit colour or grey, or a size that does not fit the data.
+    """
+    if encoding not in ENCODINGS:
+        raise InvalidMeasurement("encoding", f"image encoding '{encoding}'; known: {', '.join(ENCODINGS)}")
+    channels, conversion = ENCODINGS[encoding]
+    if height < 1 or width < 1 or step < width * channels or data.size < height * step:
+        raise InvalidMeasurement(
+            "image_size", f"image of {width} x {height} pixels, {step} bytes a row, in {data.size} bytes"
+        )
+    rows = data[: height * step].reshape(height, step)[:, : width * channels]
+    pixels = np.ascontiguousarray(rows.reshape(height, width, channels) if channels > 1 else rows)
+    return pixels if conversion is None else np.asarray(cv2.cvtColor(pixels, conversion))
+
+
+def decode_compressed(data: np.ndarray) -> np.ndarray:
+    """(H, W, 3) uint8 RGB of a JPEG or PNG file in memory (bytes as uint8).
+
+    Raises:
+        InvalidMeasurement: it is none, or damaged.
+    """
+    try:
+        image = cv2.imdecode(data, cv2.IMREAD_COLOR) if data.size else None
+    except cv2.error:
+        image = None
+    if image is None:
+        raise InvalidMeasurement("corrupt_image", f"{data.size} bytes that are no image that can be decoded")
+    return np.ascontiguousarray(image[..., ::-1])
+
+
+def encode_jpeg(image: np.ndarray, quality: int) -> bytes:
+    """JPEG file of an image (H, W, 3) uint8 BGR."""
+    done, data = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, quality])
+    if not done:
+        raise RuntimeError("OpenCV cannot encode JPEG")
+    return bytes(data)

@@ -1,0 +1,354 @@
+"""Training on tiny images: it learns, it can be interrupted, and what is wrong with the data is said or counted."""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+import signal
+import threading
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from calibslam_detector import evaluate_detector, train, weights_file
+from calibslam_detector.coco_data import DataError, TrainingImages, load_coco_data
+from calibslam_detector.covariance_task import LOSSES, Examples, covariance_task
+from calibslam_detector.network import CalibratedDetector
+from calibslam_detector.training_loop import LoopSettings, Task, TrainingError, batch_of, optimise
+from calibslam_detector.weights_file import WeightsError
+
+COLOURS = {"cup": (40, 40, 220), "book": (220, 60, 40)}
+FAST = ["--batch", "2", "--log-every", "1", "--warm-up", "0"]
+
+
+def make_data(folder: Path, count: int = 4) -> dict[str, Any]:
+    """Images of one coloured rectangle of each class, and their json."""
+    rng = np.random.default_rng(5)
+    (folder / "images").mkdir(parents=True)
+    images, annotations = [], []
+    for k in range(count):
+        image = rng.integers(0, 60, (96, 128, 3), dtype=np.uint8)
+        for label, colour in enumerate(COLOURS.values(), 1):
+            x, y = int(rng.integers(2, 40)) + 50 * (label - 1), int(rng.integers(2, 50))
+            w, h = (int(v) for v in rng.integers(20, 36, 2))
+            cv2.rectangle(image, (x, y), (x + w - 1, y + h - 1), colour, cv2.FILLED)
+            annotations.append(
+                {"id": len(annotations) + 1, "image_id": k, "category_id": label, "bbox": [x, y, w, h], "iscrowd": 0}
+            )
+        cv2.imwrite(str(folder / "images" / f"{k}.png"), image)
+        images.append({"id": k, "file_name": f"{k}.png", "width": 128, "height": 96})
+    content = {
+        "images": images,
+        "annotations": annotations,
+        "categories": [{"id": k, "name": name} for k, name in enumerate(COLOURS, 1)],
+    }
+    (folder / "annotations.json").write_text(json.dumps(content))
+    return content
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("data")
+    make_data(folder)
+    return folder
+
+
+def rows(run: Path) -> list[dict[str, str]]:
+    with (run / "log.csv").open() as file:
+        return [{k: v for k, v in row.items() if k != "seconds"} for row in csv.DictReader(file)]
+
+
+def same_weights(a: Path, b: Path) -> bool:
+    first, second = (weights_file.load(run / "weights.pt").state_dict() for run in (a, b))
+    return all(torch.equal(value, second[name]) for name, value in first.items())
+
+
+# -- data ---------------------------------------------------------------------------------------------------------
+
+
+def test_what_is_wrong_with_annotations_is_counted(tmp_path: Path) -> None:
+    content = make_data(tmp_path)
+    good = len(content["annotations"])
+    base = content["annotations"][0]
+    content["annotations"] += [
+        {**base, "image_id": 99},
+        {**base, "category_id": 7},
+        {**base, "bbox": [1, 2, 0, 5]},
+        {**base, "bbox": [1, 2, float("nan"), 5]},
+        {"image_id": 0, "category_id": 1},
+    ]
+    content["images"].append({"id": 50, "file_name": "gone.png"})
+    (tmp_path / "annotations.json").write_text(json.dumps(content))
+    data = load_coco_data(tmp_path / "annotations.json", tmp_path / "images")
+    assert data.left_out == {
+        "annotation of an unknown image": 1,
+        "annotation of an unknown class": 1,
+        "empty box": 2,
+        "annotation without bbox": 1,
+        "image file missing": 1,
+    }
+    assert data.class_names == ("cup", "book") and sum(len(image.boxes) for image in data.images) == good
+    x, y, w, h = base["bbox"]
+    assert data.images[0].boxes[0].tolist() == [x, y, x + w, y + h]
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("{", "are not JSON"),
+        ("[]", "is not COCO json"),
+        ('{"images": [], "annotations": [], "categories": [{"id": 1, "name": "cup"}]}', "no image with a box"),
+    ],
+)
+def test_a_file_that_is_no_data_set_is_refused(tmp_path: Path, text: str, message: str) -> None:
+    (tmp_path / "a.json").write_text(text)
+    with pytest.raises(DataError, match=message):
+        load_coco_data(tmp_path / "a.json", tmp_path)
+    with pytest.raises(DataError, match="cannot be read"):
+        load_coco_data(tmp_path / "none.json", tmp_path)
+
+
+def test_classes_are_those_of_the_detector(data: Path) -> None:
+    known = load_coco_data(data / "annotations.json", data / "images", ("chair", "book"))
+    assert {int(label) for image in known.images for label in image.labels} == {2}
+    assert known.left_out["annotation of an unknown class"] == 4
+    with pytest.raises(DataError, match="has no class of sofa"):
+        load_coco_data(data / "annotations.json", data / "images", ("sofa",))
+
+
+def test_mirrored_boxes_stay_on_their_objects(data: Path) -> None:
+    images = TrainingImages(load_coco_data(data / "annotations.json", data / "images"))
+    mirrored = 0
+    for seed in range(8):
+        image, target = images[(0, seed)]
+        again, _ = images[(0, seed)]
+        assert torch.equal(image, again)
+        for box, label in zip(target["boxes"].int().tolist(), target["labels"].tolist(), strict=True):
+            patch = image[:, box[1] : box[3], box[0] : box[2]].mean(dim=(1, 2))
+            assert patch.argmax() == (0 if label == 1 else 2)  # red cup, blue book
+        mirrored += int(target["boxes"][0, 0] > 40)
+    assert 0 < mirrored < 8
+
+
+def test_every_sample_comes_once_per_epoch() -> None:
+    epoch = np.concatenate([batch_of(step, 3, 12, seed=1) for step in range(4)])
+    assert sorted(epoch) == list(range(12))
+    following = np.concatenate([batch_of(step, 3, 12, seed=1) for step in range(4, 8)])
+    assert sorted(following) == list(range(12)) and not np.array_equal(epoch, following)
+    across = np.concatenate([batch_of(step, 5, 12, seed=1) for step in range(12)])
+    assert np.array_equal(np.bincount(across), np.full(12, 5))
+
+
+# -- stage detector -----------------------------------------------------------------------------------------------
+
+
+def test_an_interrupted_training_ends_as_one_in_one_go(data: Path, tmp_path: Path) -> None:
+    options = [str(data), *FAST, "--steps", "4", "--checkpoint-every", "2"]
+    assert train.main([*options, "--out", str(tmp_path / "once")]) == 0
+    interrupted = [*options, "--out", str(tmp_path / "twice")]
+    timer = threading.Thread(target=interrupt_after_a_line, args=(tmp_path / "twice" / "log.csv",))
+    timer.start()
+    assert train.main(interrupted) == train.INTERRUPTED
+    timer.join()
+    assert not (tmp_path / "twice" / "weights.pt").exists()
+    assert train.main(interrupted) == 1  # neither begun again by mistake
+    assert train.main([*interrupted, "--resume"]) == 0
+    assert rows(tmp_path / "twice") == rows(tmp_path / "once")
+    assert len(rows(tmp_path / "once")) == 4
+    assert same_weights(tmp_path / "once", tmp_path / "twice")
+    assert cv2.imread(str(tmp_path / "once" / "curves.png")) is not None
+    # Nor gone on with as if it were another one.
+    assert train.main([*interrupted, "--resume", "--seed", "9"]) == 1
+
+
+def interrupt_after_a_line(log: Path) -> None:
+    while not (log.exists() and len(log.read_text().splitlines()) > 1):
+        threading.Event().wait(0.01)
+    os.kill(os.getpid(), signal.SIGINT)
+
+
+def test_a_corrupt_image_is_left_out_and_counted(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    make_data(tmp_path / "data", 2)
+    (tmp_path / "data" / "images" / "0.png").write_bytes(b"no image")
+    assert train.main([str(tmp_path / "data"), *FAST, "--steps", "2", "--out", str(tmp_path / "run")]) == 0
+    assert "left out: image that cannot be read (2)" in capsys.readouterr().out
+
+
+def test_a_run_folder_is_not_overwritten(data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "mine.txt").touch()
+    assert train.main([str(data), "--out", str(tmp_path)]) == 1
+    assert "exists already" in capsys.readouterr().err
+    assert train.main([str(data), "--out", str(tmp_path), "--resume"]) == 1
+    assert "no checkpoint" in capsys.readouterr().err
+
+
+def test_a_loss_that_is_not_finite_ends_training_with_the_last_good_state(tmp_path: Path) -> None:
+    module = torch.nn.Linear(1, 1)
+    losses = {step: float("nan") if step >= 3 else 1.0 for step in range(60)}
+    task = Task(
+        module,
+        list(module.parameters()),
+        lambda step: {"loss": losses[step] * module.weight.square().sum()},
+        torch.device("cpu"),
+    )
+    with pytest.raises(TrainingError, match="no finite loss in 20 steps"):
+        optimise(task, LoopSettings(steps=60, checkpoint_every=1, log_every=1), tmp_path, {}, resume=False)
+    assert torch.isfinite(module.weight).all()
+    assert len(rows(tmp_path)) == 3
+
+
+def test_the_learning_rate_rises_and_falls() -> None:
+    settings = LoopSettings(steps=100, learning_rate=1.0, warm_up=9)
+    assert settings.rate(0) == pytest.approx(0.1)
+    assert settings.rate(50) == pytest.approx(0.5)
+    assert settings.rate(99) < 0.001
+
+
+# -- stage covariance ---------------------------------------------------------------------------------------------
+
+
+def examples(count: int) -> tuple[Examples, torch.Tensor]:
+    """Residuals whose true standard deviations (M, 4) depend on the features."""
+    generator = torch.Generator().manual_seed(3)
+    features = torch.randn(count, 4, generator=generator).repeat(1, 64)
+    sigma = torch.exp(0.5 * features[:, :4] - 1.0)
+    residuals = sigma * torch.randn(count, 4, generator=generator)
+    labels = torch.randint(1, 3, (count,), generator=generator)
+    return Examples(features, torch.zeros(count, 7), labels, residuals, torch.ones(count, dtype=torch.bool)), sigma
+
+
+@pytest.mark.parametrize("loss", list(LOSSES))
+def test_the_head_learns_true_variances(loss: str, tmp_path: Path) -> None:
+    torch.manual_seed(0)
+    model = CalibratedDetector("compact", ("cup", "book"))
+    before = {name: value.clone() for name, value in model.detector.state_dict().items()}
+    learnt, sigma = examples(4000)
+    settings = LoopSettings(steps=150, learning_rate=3e-3, warm_up=0, log_every=50)
+    optimise(covariance_task(model, learnt, loss, 512, settings, torch.device("cpu")), settings, tmp_path, {}, False)
+    with torch.no_grad():
+        variances, _ = model.covariance_head(learnt.features, learnt.geometries, learnt.labels)
+    ratio = torch.log(variances.sqrt() / sigma)
+    # sigma varies by a factor of e^0.5 about its mean; learnt, a good part of that is explained.
+    assert ratio.std() < 0.4
+    assert abs(ratio.mean()) < (0.5 if loss == "calibration" else 0.15)
+    for name, value in model.detector.state_dict().items():
+        assert torch.equal(value, before[name]), name
+
+
+def test_both_stages_and_evaluation(data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """On untrained weights: with every proposal a detection, some lie on an object."""
+    torch.manual_seed(1)
+    model = CalibratedDetector("compact", tuple(COLOURS))
+    weights_file.save(model, tmp_path / "begin.pt")
+    monkeypatch.setattr("calibslam_detector.matching.MIN_OVERLAP", 0.02)
+    monkeypatch.setattr(train, "MIN_EXAMPLES", 2)
+    options = ["--stage", "covariance", "--weights", str(tmp_path / "begin.pt"), "--loss", "nll", "--steps", "3"]
+    out = tmp_path / "run"
+    assert train.main([str(data), *options, "--log-every", "1", "--out", str(out)]) == 0
+    trained = weights_file.load(out / "weights.pt")
+    for name, value in model.detector.state_dict().items():
+        assert torch.equal(trained.detector.state_dict()[name], value), name
+    assert [set(row) for row in rows(out)] == [{"step", "learning_rate", "nll"}] * 3
+    (out / "weights.pt").unlink()
+    assert train.main([str(data), *options, "--log-every", "1", "--out", str(out), "--resume"]) == 0
+    arguments = [
+        "--weights",
+        str(out / "weights.pt"),
+        "--out",
+        str(tmp_path / "evaluation"),
+        "--score-threshold",
+        "0.05",
+    ]
+    assert evaluate_detector.main([str(data), *arguments]) == 0
+    result = json.loads((tmp_path / "evaluation" / "metrics.json").read_text())
+    assert result["images"] == 4 and 0.0 <= result["map"] <= 1.0
+
+
+def test_stage_covariance_needs_a_detector(data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert train.main([str(data), "--stage", "covariance", "--out", str(tmp_path / "run")]) == 1
+    assert "--weights FILE" in capsys.readouterr().err
+
+
+def test_too_few_boxes_found_again_are_said(data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    weights_file.save(CalibratedDetector("compact", tuple(COLOURS)), tmp_path / "begin.pt")
+    options = ["--stage", "covariance", "--weights", str(tmp_path / "begin.pt"), "--out", str(tmp_path / "run")]
+    assert train.main([str(data), *options]) == 1
+    assert "were found again by the detector" in capsys.readouterr().err
+
+
+# -- files --------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def saved(tmp_path_factory: pytest.TempPathFactory) -> tuple[CalibratedDetector, Path]:
+    model = CalibratedDetector("compact", tuple(COLOURS)).eval()
+    path = tmp_path_factory.mktemp("weights") / "w.pt"
+    weights_file.save(model, path)
+    return model, path
+
+
+def test_a_file_gives_the_same_detector(saved: tuple[CalibratedDetector, Path], tmp_path: Path) -> None:
+    model, path = saved
+    loaded = weights_file.load(path)
+    image = [torch.rand(3, 96, 128)]
+    model.detector.roi_heads.score_thresh = loaded.detector.roi_heads.score_thresh = 0.0
+    with torch.no_grad():
+        for a, b in zip(model.detect(image), loaded.detect(image), strict=True):
+            assert all(torch.equal(a[name], b[name]) for name in a) and len(a["boxes"]) > 0
+    weights_file.save(model, tmp_path / "half.pt", half=True)
+    assert (tmp_path / "half.pt").stat().st_size < 0.55 * path.stat().st_size
+    assert (tmp_path / "half.pt").stat().st_size < 25e6
+    half = weights_file.load(tmp_path / "half.pt")
+    assert next(half.parameters()).dtype == torch.float32
+
+
+def test_files_that_cannot_be_used_are_refused(saved: tuple[CalibratedDetector, Path], tmp_path: Path) -> None:
+    _, path = saved
+    content = torch.load(path, weights_only=True)
+    weights = content["weights"]
+    name = "detector.roi_heads.box_predictor.cls_score.weight"
+    bad = {
+        "is not a detector of CalibSLAM": weights,
+        "has version 9": {**content, "version": 9},
+        "lacks class_names": {k: v for k, v in content.items() if k != "class_names"},
+        "unknown architecture 'yolo'": {**content, "architecture": "yolo"},
+        "does not fit mobilenet_v3_large_320_fpn": {**content, "architecture": "mobilenet_v3_large_320_fpn"},
+        "does not fit compact": {**content, "class_names": ["cup"]},
+        "holds NaN": {**content, "weights": {**weights, name: weights[name] * float("nan")}},
+    }
+    for message, value in bad.items():
+        torch.save(value, tmp_path / "bad.pt")
+        with pytest.raises(WeightsError, match=message):
+            weights_file.load(tmp_path / "bad.pt")
+    (tmp_path / "cut.pt").write_bytes(path.read_bytes()[:100_000])
+    (tmp_path / "text.pt").write_text("hello")
+    (tmp_path / "evil.pt").write_bytes(b"cos\nsystem\n(S'true'\ntR.")
+    for file in ("cut.pt", "text.pt", "evil.pt"):
+        with pytest.raises(WeightsError, match="damaged or not written by torch"):
+            weights_file.load(tmp_path / file)
+    with pytest.raises(WeightsError, match="cannot be read"):
+        weights_file.load(tmp_path / "none.pt")
+
+
+def test_weights_of_torchvision_load(data: Path, tmp_path: Path) -> None:
+    """Its file is a plain state dict of 91 classes, without counts of batches where normalisation is frozen."""
+    torch.manual_seed(2)
+    model = CalibratedDetector("mobilenet_v3_large_320_fpn", tuple(map(str, range(90))), frozen_norm=True)
+    torch.save(model.detector.state_dict(), tmp_path / "coco.pth")
+    loaded = weights_file.load_coco(tmp_path / "coco.pth", "mobilenet_v3_large_320_fpn")
+    assert loaded.frozen_norm and loaded.class_names[0] == "person" and "cup" in loaded.class_names
+    for name, value in model.detector.state_dict().items():
+        assert torch.equal(loaded.detector.state_dict()[name], value)
+    with pytest.raises(WeightsError, match="no COCO weights of compact"):
+        weights_file.load_coco(tmp_path / "coco.pth", "compact")
+    options = ["--architecture", "mobilenet_v3_large_320_fpn", "--coco-weights", str(tmp_path / "coco.pth")]
+    assert train.main([str(data), *options, *FAST, "--steps", "1", "--out", str(tmp_path / "run")]) == 0
+    trained = weights_file.load(tmp_path / "run" / "weights.pt")
+    assert trained.class_names == tuple(COLOURS) and trained.frozen_norm
+    frozen = "detector.backbone.body.0.1.weight"
+    assert torch.equal(trained.state_dict()[frozen], loaded.state_dict()[frozen])
