@@ -24,7 +24,7 @@ from calibslam_backend.association import GIVEN
 from calibslam_backend.box_measurement import undistorted
 from calibslam_backend.data_association import DataAssociation
 from calibslam_backend.estimator_settings import EstimatorSettings
-from calibslam_backend.graph import ObjectGraph
+from calibslam_backend.graph import Motion, ObjectGraph
 from calibslam_backend.kernels import load_kernels
 from calibslam_backend.object_map import ObjectMap
 from calibslam_backend.odometry import MotionChain
@@ -81,7 +81,7 @@ class Estimator:
         self.stamps: list[int] = []
         self._motions = MotionChain(self.settings, self._T_body_camera)
         self._tracker = Tracker(self.settings, self.camera.K)
-        self._graph = ObjectGraph(self.camera.K, self.settings, self.settings)
+        self._graph = ObjectGraph(self.camera.K, self.settings, self.settings, self.settings)
         self._objects = DataAssociation(self._graph, self.camera, self.settings, self.counts)
         self._given: dict[str, int] = {}
         self._waiting: list[tuple[int, int, Boxes]] = []
@@ -251,12 +251,13 @@ class Estimator:
             turned = self._motions.between(self._last_frame, boxes.stamp)[0][:3, :3].T
         self._last_frame = boxes.stamp
         boxes, tracks = self._tracks(boxes, turned)
-        motion, covariance = np.eye(4), np.eye(6)
+        motion = None
         if self.stamps:
-            motion, covariance = self._motions.between(self.stamps[-1], boxes.stamp)
-            if not self._moved(motion, boxes.stamp - self.stamps[-1]):
+            interval = self.stamps[-1], boxes.stamp
+            motion = Motion(*self._motions.between(*interval), self._motions.drifts(*interval))
+            if not self._moved(motion.T, boxes.stamp - self.stamps[-1]):
                 return None
-        return self._keyframe(boxes, tracks, motion, covariance, began)
+        return self._keyframe(boxes, tracks, motion, began)
 
     def _tracks(self, boxes: Boxes, R_now_before: Array) -> tuple[Boxes, list[int]]:
         """The boxes that belong to a track, and the number of that track."""
@@ -284,20 +285,20 @@ class Estimator:
             or duration >= s.keyframe_interval * SECOND
         )
 
-    def _keyframe(self, boxes: Boxes, tracks: list[int], motion: Array, covariance: Array, began: float) -> Keyframe:
+    def _keyframe(self, boxes: Boxes, tracks: list[int], motion: Motion | None, began: float) -> Keyframe:
         objects = self._objects
         measurements = objects.measurements(boxes, tracks)
         k = len(self.stamps)
-        if k:
-            guess = objects.localise(tracks, measurements, self._graph.pose(k - 1) @ motion, covariance)
-            self._graph.add_pose(motion, covariance, guess)
-        else:
+        if motion is None:
             self._graph.add_origin()
+        else:
+            guess = objects.localise(tracks, measurements, self._graph.predict(motion), motion.covariance)
+            self._graph.add_pose(motion, guess)
         self.stamps.append(boxes.stamp)
         self._motions.forget_before(boxes.stamp)
         used = objects.give_to_bound(k, tracks, measurements)
-        if k:
-            objects.vote(k, tracks, measurements, covariance)
+        if motion is not None:
+            objects.vote(k, tracks, measurements, motion.covariance)
             objects.relocalise(k, tracks, measurements)
         objects.keep_open(k, tracks, measurements)
         added = objects.start_quadrics(tracks)

@@ -1,6 +1,7 @@
 """The factor graph of camera poses and quadrics, solved incrementally by ISAM2 (document, eq. 2.3.5 and 4.3.3).
 
-Keys: x(k) pose of keyframe k; q(j) quadric j, a vector of centre and logarithmic shape (see `quadric`).
+Keys: x(k) pose of keyframe k; q(j) quadric j, a vector of centre and logarithmic shape (see `quadric`); d(0) the
+drift of odometry (see `odometry_factor`), where its covariance is unknown.
 
 A graph never stays broken. A quadric that runs away is taken out, an update that fails is repaired by building
 the tree anew without the quadric at fault, and both are reported.
@@ -18,12 +19,15 @@ from gtsam import symbol
 from calibslam_backend.box_factor import box_factor
 from calibslam_backend.box_measurement import BoxMeasurement
 from calibslam_backend.initialisation import InitialisationSettings
-from calibslam_backend.odometry import dead_reckoning
+from calibslam_backend.odometry import MotionNoise, dead_reckoning
+from calibslam_backend.odometry_factor import DRIFT, drifting_motion_factor
 from calibslam_backend.quadric import matrix_from_vector
 from calibslam_msgs_py.measurements import Array
 from calibslam_msgs_py.settings import Settings, setting
 
 log = logging.getLogger(__name__)
+
+_DRIFT = symbol("d", 0)
 
 
 # The first keyframe is the origin of the map, whose axes are those of REP 103: x forward, y left, z up, while a
@@ -44,6 +48,15 @@ class GraphSettings(Settings):
     relinearise_pose: float = setting(0.01, "change of a pose that asks for one", unit="rad and m", low=0.0)
     relinearise_quadric: float = setting(0.03, "change of a quadric that asks for one", unit="m and log m", low=0.0)
     young: int = setting(20, "keyframes during which a quadric is relinearised at once", low=0)
+
+
+@dataclass(frozen=True)
+class Motion:
+    """Between consecutive poses: (4, 4) as measured, its covariance (6, 6), and the time [s] during which it drifts."""
+
+    T: Array
+    covariance: Array
+    drifts: float
 
 
 @dataclass
@@ -74,12 +87,16 @@ class ObjectGraph:
     BATCH_ITERATIONS, REPAIR_ITERATIONS = 100, 15
     CONVERGED = 1e-4  # share by which an iteration has to lower the error
 
-    def __init__(self, K: Array, settings: GraphSettings, priors: InitialisationSettings) -> None:
+    def __init__(
+        self, K: Array, settings: GraphSettings, priors: InitialisationSettings, noise: MotionNoise
+    ) -> None:
         self._K = np.ascontiguousarray(K, float)
         self._settings = settings
         self._prior = priors.prior_covariance()
+        self._drift_sigmas = np.repeat([noise.drift_rotation, noise.drift_translation], 3)
+        self._drifts = False
         self._has_origin = False
-        self._motions: list[tuple[Array, Array]] = []  # between consecutive poses, with covariance
+        self._motions: list[Motion] = []
         self.landmarks: dict[int, Landmark] = {}
         self._origin = gtsam.Pose3(T_MAP_FIRST_CAMERA)
         self._isam = self._new_isam()
@@ -104,7 +121,17 @@ class ObjectGraph:
 
     def odometry(self) -> tuple[Array, Array]:
         """What odometry alone says: poses (N, 4, 4) and their covariances (N, 6, 6), from the same origin."""
-        return dead_reckoning(self._origin.matrix(), np.eye(6) * self._settings.prior_sigma**2, self._motions)
+        steps = [(motion.T, motion.covariance) for motion in self._motions]
+        return dead_reckoning(self._origin.matrix(), np.eye(6) * self._settings.prior_sigma**2, steps)
+
+    def drift(self) -> Array:
+        """(6,) velocity [rad/s, m/s] that odometry misses; zero while nothing is known of it."""
+        return np.asarray(self._values.atVector(_DRIFT)) if self._drifts else np.zeros(DRIFT)
+
+    def predict(self, motion: Motion) -> Array:
+        """(4, 4) T_map_camera after a motion from the newest pose."""
+        correction = gtsam.Pose3.Expmap(motion.drifts * self.drift())
+        return np.asarray(self.pose(self.size - 1) @ motion.T @ correction.matrix())
 
     def quadric(self, j: int) -> Array:
         """(9,) centre and logarithmic shape."""
@@ -140,13 +167,18 @@ class ObjectGraph:
         for values in (self._new_values, self._values):
             values.insert(symbol("x", 0), self._origin)
 
-    def add_pose(self, motion: Array, covariance: Array, guess: Array) -> int:
-        """The next pose, after a motion (4, 4) from the last one with covariance (6, 6); returns its number.
+    def add_pose(self, motion: Motion, guess: Array) -> int:
+        """The next pose, after a motion from the last one; returns its number.
 
         The optimisation starts from `guess` (4, 4), its pose in the map.
         """
         k = self.size
-        self._motions.append((motion, covariance))
+        self._motions.append(motion)
+        if motion.drifts and not self._drifts:
+            self._drifts = True
+            self._add_drift_factor()
+            for values in (self._new_values, self._values):
+                values.insert(_DRIFT, np.zeros(DRIFT))
         self._add_motion_factor(k)
         for values in (self._new_values, self._values):
             values.insert(symbol("x", k), gtsam.Pose3(guess))
@@ -221,11 +253,13 @@ class ObjectGraph:
         self._values = self._isam.calculateEstimate()
 
     def _order(self) -> gtsam.KeyGroupMap:
-        """Quadrics and the newest pose are eliminated last: the next update will touch them again."""
+        """Quadrics, the drift and the newest pose are eliminated last: the next update will touch them again."""
         groups = gtsam.KeyGroupMap()
         for j in self.landmarks:
             groups.insert2(symbol("q", j), 1)
         groups.insert2(symbol("x", self.size - 1), 1)
+        if self._drifts:
+            groups.insert2(_DRIFT, 1)
         return groups
 
     def _settled(self) -> gtsam.KeyList:
@@ -298,6 +332,8 @@ class ObjectGraph:
 
     def _add_all_factors(self) -> None:
         self._add_origin_factor()
+        if self._drifts:
+            self._add_drift_factor()
         for k in range(1, self.size):
             self._add_motion_factor(k)
         for j, landmark in self.landmarks.items():
@@ -310,7 +346,8 @@ class ObjectGraph:
         parameters.relinearizeSkip = 1  # `update` says itself what may be relinearised
         thresholds = gtsam.ISAM2ThresholdMap()
         pose, quadric = self._settings.relinearise_pose, self._settings.relinearise_quadric
-        for name, size, threshold in (("x", 6, pose), ("q", 9, quadric)):
+        # The factors are linear in the drift: there is nothing to relinearise.
+        for name, size, threshold in (("x", 6, pose), ("q", 9, quadric), ("d", DRIFT, np.inf)):
             thresholds.insert((name, np.full(size, threshold)))
         parameters.setRelinearizeThreshold(thresholds)
         return gtsam.ISAM2(parameters)
@@ -332,12 +369,20 @@ class ObjectGraph:
         self._add(gtsam.PriorFactorPose3(symbol("x", 0), self._origin, noise))
 
     def _add_motion_factor(self, k: int) -> None:
-        motion, covariance = self._motions[k - 1]
+        motion = self._motions[k - 1]
         noise = gtsam.noiseModel.Robust.Create(
             gtsam.noiseModel.mEstimator.Cauchy.Create(self._settings.robust_odometry),
-            gtsam.noiseModel.Gaussian.Covariance(covariance),
+            gtsam.noiseModel.Gaussian.Covariance(motion.covariance),
         )
-        self._add(gtsam.BetweenFactorPose3(symbol("x", k - 1), symbol("x", k), gtsam.Pose3(motion), noise))
+        start, end = symbol("x", k - 1), symbol("x", k)
+        if motion.drifts:
+            self._add(drifting_motion_factor(start, end, _DRIFT, motion.T, motion.drifts, noise))
+        else:
+            self._add(gtsam.BetweenFactorPose3(start, end, gtsam.Pose3(motion.T), noise))
+
+    def _add_drift_factor(self) -> None:
+        noise = gtsam.noiseModel.Diagonal.Sigmas(self._drift_sigmas)
+        self._add(gtsam.PriorFactorVector(_DRIFT, np.zeros(DRIFT), noise))
 
     def _add_prior_factor(self, j: int) -> None:
         landmark = self.landmarks[j]
