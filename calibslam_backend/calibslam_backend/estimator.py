@@ -68,6 +68,8 @@ class Keyframe:
 class Estimator:
     """Incremental object SLAM of one camera."""
 
+    ROUNDS = 5  # of association and optimisation at the end
+
     def __init__(self, camera: Camera, T_body_camera: Array, settings: EstimatorSettings) -> None:
         load_kernels()
         self.camera = camera
@@ -86,7 +88,6 @@ class Estimator:
         self._given: dict[str, int] = {}
         self._waiting: list[tuple[int, int, Boxes]] = []
         self._last_frame: int | None = None
-        self.associations: list[tuple[int, str]] = []  # track and true identity of each box of a keyframe
 
     # -- measurements in ----------------------------------------------------------------------------------------
 
@@ -137,6 +138,16 @@ class Estimator:
         """Relinearise until nothing moves any more: the best estimate of all that was seen."""
         if not self.stamps:
             return
+        for _ in range(self.ROUNDS):
+            changed = self._objects.revise()
+            self._objects.start_leftovers()
+            self._converge(iterations)
+            self._objects.merge()
+            if not changed:
+                break
+        self._converge(iterations)
+
+    def _converge(self, iterations: int) -> None:
         for _ in range(iterations):
             before = self._graph.poses()
             self._objects.note(self._graph.update(everything=True))
@@ -221,9 +232,10 @@ class Estimator:
             classes = Counter({quadric.class_id: max(quadric.observations, 1)})
             self._objects.know(quadric.id, vector, covariance, classes)
 
-    def quadric_of_track(self, track: int) -> int | None:
-        """The quadric a track is bound to."""
-        return self._objects.quadric_of_track(track)
+    def associations(self) -> list[tuple[int | None, str]]:
+        """For each box of a keyframe the quadric it is given to, and its true identity ("": unknown)."""
+        frames = self._objects.frames
+        return [pair for frame in frames for pair in zip(frame.quadrics, frame.names, strict=True)]
 
     def optimise(self) -> None:
         """Move the whole graph to its batch optimum."""
@@ -287,25 +299,24 @@ class Estimator:
 
     def _keyframe(self, boxes: Boxes, tracks: list[int], motion: Motion | None, began: float) -> Keyframe:
         objects = self._objects
-        measurements = objects.measurements(boxes, tracks)
+        frame = objects.frame(boxes, tracks)
         k = len(self.stamps)
         if motion is None:
             self._graph.add_origin()
         else:
-            guess = objects.localise(tracks, measurements, self._graph.predict(motion), motion.covariance)
+            guess = objects.localise(frame, self._graph.predict(motion), motion.covariance)
             self._graph.add_pose(motion, guess)
         self.stamps.append(boxes.stamp)
         self._motions.forget_before(boxes.stamp)
-        used = objects.give_to_bound(k, tracks, measurements)
+        used = objects.add(frame)
         if motion is not None:
-            objects.vote(k, tracks, measurements, motion.covariance)
-            objects.relocalise(k, tracks, measurements)
-        objects.keep_open(k, tracks, measurements)
+            objects.vote(k, motion.covariance)
+            objects.relocalise(k)
         added = objects.start_quadrics(tracks)
         report = self._graph.update()
         self._objects.note(report)
         removed = report.removed + objects.merge()
-        self.associations += list(zip(tracks, boxes.object_ids, strict=True))
+        objects.revise(self.settings.revised)
         return Keyframe(
             k,
             boxes.stamp,
