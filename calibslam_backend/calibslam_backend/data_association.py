@@ -279,7 +279,9 @@ class DataAssociation:
         if number is None:
             turn: Iterable[int] = range(len(self.frames))
         else:
-            turn = [k % settled for k in range(self._revised, self._revised + min(number, settled))] if settled > 0 else []
+            turn = (
+                [k % settled for k in range(self._revised, self._revised + min(number, settled))] if settled > 0 else []
+            )
             self._revised = (turn[-1] + 1) % settled if turn else 0
         changed = 0
         for k in turn:
@@ -306,6 +308,7 @@ class DataAssociation:
             ids,
             [self.classes[j] for j in ids],
             self.camera.K,
+            (self.camera.width, self.camera.height),
             self.settings,
         )
         changed = [n for n, (old, new) in enumerate(zip(frame.quadrics, revised, strict=True)) if old != new]

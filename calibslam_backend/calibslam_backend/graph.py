@@ -81,9 +81,7 @@ class ObjectGraph:
     LARGEST_STEP = 0.5  # [rad, m] of a pose in one update; more is checked by a damped optimisation
     REPAIR_ITERATIONS = 15
 
-    def __init__(
-        self, K: Array, settings: GraphSettings, priors: InitialisationSettings, noise: MotionNoise
-    ) -> None:
+    def __init__(self, K: Array, settings: GraphSettings, priors: InitialisationSettings, noise: MotionNoise) -> None:
         self._K = np.ascontiguousarray(K, float)
         self._settings = settings
         self._prior = priors.prior_covariance()

@@ -11,6 +11,8 @@ from collections.abc import Hashable, Iterable
 import gtsam
 import numpy as np
 
+from calibslam_msgs_py.measurements import Array
+
 Name = Hashable
 
 
@@ -30,11 +32,13 @@ class Smoother:
         self._factors: dict[Name, gtsam.NonlinearFactor] = {}
         self._slots: dict[Name, int] = {}  # of the factors in the tree
         self._isam = self._new_isam()
+        self._new: list[Name]
+        self._to_remove: list[int]
         self._begin()
 
     # -- changes ------------------------------------------------------------------------------------------------
 
-    def insert(self, key: int, value: object) -> None:
+    def insert(self, key: int, value: gtsam.Pose3 | Array) -> None:
         """A new variable."""
         for values in (self._new_values, self.values):
             values.insert(key, value)
@@ -113,7 +117,7 @@ class Smoother:
         self._new_values = values
         self.update(last, ())
 
-    def marginal(self, key: int) -> np.ndarray:
+    def marginal(self, key: int) -> Array:
         """Covariance of a variable."""
         return np.asarray(self._isam.marginalCovariance(key))
 
@@ -123,9 +127,10 @@ class Smoother:
         return self._isam.jointMarginalCovariance(keys)
 
     def _begin(self) -> None:
-        self._new: list[Name] = []
+        """Nothing waits for an update."""
+        self._new = []
         self._new_values = gtsam.Values()
-        self._to_remove: list[int] = []
+        self._to_remove = []
 
     def _graph(self, names: Iterable[Name]) -> gtsam.NonlinearFactorGraph:
         graph = gtsam.NonlinearFactorGraph()
