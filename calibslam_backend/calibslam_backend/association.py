@@ -35,8 +35,9 @@ class AssociationSettings(Settings):
     min_overlap: float = setting(0.2, "intersection over union of predicted and measured box", low=0.0, high=1.0)
     votes: int = setting(3, "keyframes that must agree before a track is bound to a landmark", low=1)
     model_error: float = setting(
-        0.1, "error of the ellipsoid as a model of the object, as a share of its box", low=0.0, high=1.0
+        0.2, "error of the ellipsoid as a model of the object, as a share of its box", low=0.0, high=1.0
     )
+    revised: int = setting(10, "earlier keyframes, with each new one, whose boxes are judged anew", low=0)
     wrong_class: float = setting(0.05, "share of boxes that carry a wrong class", low=1e-6, high=0.5)
     merge_distance: float = setting(
         0.7,
@@ -85,6 +86,16 @@ def predict(
     size = corners[2:] - corners[:2]
     own = np.diag(np.tile(model_error * size, 2) ** 2)
     return corners, J @ covariance @ J.T + own
+
+
+def class_cost(classes: Counter[str], class_id: str, wrong_class: float) -> float:
+    """-2 log of the probability that a box of a quadric whose boxes have these classes carries `class_id`.
+
+    Up to a constant: the boxes' own frequencies, mixed with a share of wrong classes.
+    """
+    total = classes.total()
+    share = classes[class_id] / total if total else 0.0
+    return -2.0 * math.log((1.0 - wrong_class) * share + wrong_class)
 
 
 def distances(

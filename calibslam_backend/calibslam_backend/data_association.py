@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
+from collections.abc import Iterable, Set
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -29,17 +30,37 @@ from calibslam_backend.initialisation import initialise
 from calibslam_backend.localisation import localise
 from calibslam_backend.noise import NoiseModel
 from calibslam_backend.relocalisation import relocalise
+from calibslam_backend.revision import revise
 from calibslam_backend.tracking import overlap
 from calibslam_msgs_py.measurements import Array, Boxes, Camera
 
 
 @dataclass
-class Candidate:
-    """What is known of a track: its boxes in keyframes, its classes, the quadric it is bound to."""
+class Frame:
+    """The boxes of a keyframe.
 
-    boxes: list[tuple[int, BoxMeasurement]] = field(default_factory=list)
+    Attributes:
+        boxes: what was measured.
+        tracks: that they belong to.
+        classes: that they carry.
+        names: their true identities, "" where unknown.
+        quadrics: that they are given to; None: none so far.
+    """
+
+    boxes: list[BoxMeasurement]
+    tracks: list[int]
+    classes: tuple[str, ...]
+    names: tuple[str, ...]
+    quadrics: list[int | None]
+
+
+@dataclass
+class Candidate:
+    """What is known of a track: its boxes (keyframe, row), its classes in all images, the quadric it is bound to."""
+
+    seen: list[tuple[int, int]] = field(default_factory=list)
     classes: Counter[str] = field(default_factory=Counter)
-    landmark: int | None = None
+    quadric: int | None = None
     misfits: int = 0
 
 
@@ -47,7 +68,8 @@ class DataAssociation:
     """Tracks and the quadrics they are bound to; gives the graph its quadrics and boxes.
 
     Attributes:
-        classes: for each quadric, how often its boxes had which class.
+        frames: the boxes of every keyframe and what became of them.
+        classes: for each quadric, how many of its boxes have which class.
         counts: what happened, by name; shared with the estimator.
     """
 
@@ -55,9 +77,12 @@ class DataAssociation:
     MAX_MISFITS = 3
     LEAST_FIT = 0.1  # overlap of a box with its quadric's that is no misfit
     YOUNG = 30  # keyframes during which a quadric may turn out to be one that was known before
+    UNSETTLED = 10  # newest keyframes, whose boxes are not judged anew yet
+    LEAST_BOXES = 3  # fewer do not determine a quadric
 
     def __init__(self, graph: ObjectGraph, camera: Camera, settings: EstimatorSettings, counts: Counter[str]) -> None:
         self.camera, self.settings, self.counts = camera, settings, counts
+        self.frames: list[Frame] = []
         self.classes: dict[int, Counter[str]] = {}
         self._graph = graph
         self._noise = NoiseModel(settings)
@@ -65,6 +90,8 @@ class DataAssociation:
         self._candidates: dict[int, Candidate] = {}
         self._next_quadric = 0
         self._same: list[tuple[int, int]] = []  # quadrics found to be others; united after the update
+        self._known: set[int] = set()  # quadrics of a loaded map
+        self._revised = 0  # the next keyframe to be revised
 
     def see(self, tracks: list[int], class_ids: tuple[str, ...]) -> None:
         """The tracks of an image and the classes of their boxes."""
@@ -74,6 +101,7 @@ class DataAssociation:
     def know(self, j: int, vector: Array, covariance: Array, classes: Counter[str]) -> None:
         """A quadric of a loaded map."""
         self._graph.add_known_quadric(j, vector, covariance)
+        self._known.add(j)
         self.classes[j] = classes
         self._next_quadric = max(self._next_quadric, j + 1)
 
@@ -81,51 +109,39 @@ class DataAssociation:
         """The class most of its boxes carry."""
         return self.classes[j].most_common(1)[0][0]
 
-    def keep_open(self, k: int, tracks: list[int], measurements: list[BoxMeasurement]) -> None:
-        """Boxes of tracks that are still open are kept with them."""
-        for track, box in zip(tracks, measurements, strict=True):
-            candidate = self._candidates[track]
-            if candidate.landmark is None:
-                candidate.boxes.append((k, box))
-
-    def quadric_of_track(self, track: int) -> int | None:
-        """The quadric a track is bound to."""
-        return self._candidates[track].landmark
-
-    def measurements(self, boxes: Boxes, tracks: list[int]) -> list[BoxMeasurement]:
+    def frame(self, boxes: Boxes, tracks: list[int]) -> Frame:
+        """The boxes of an image made ready, with the covariances the noise model gives them."""
         covariances = np.empty((len(boxes), 4, 4))
         for i, track in enumerate(tracks):
-            landmark = self._candidates[track].landmark
-            key = ~track if landmark is None else landmark
+            quadric = self._candidates[track].quadric
+            key = ~track if quadric is None else quadric
             self._noise.observe(key, boxes.corners[i])
             covariances[i] = self._noise.covariance(key, boxes.covariances[i])
-        return prepare(boxes, covariances, self.camera)
+        measurements = prepare(boxes, covariances, self.camera)
+        return Frame(measurements, tracks, boxes.class_ids, boxes.object_ids, [None] * len(boxes))
 
-    def localise(
-        self, tracks: list[int], measurements: list[BoxMeasurement], predicted: Array, covariance: Array
-    ) -> Array:
+    def localise(self, frame: Frame, predicted: Array, covariance: Array) -> Array:
         """First estimate of the pose, from odometry and the boxes of bound tracks."""
-        bound = [(self._candidates[t].landmark, box) for t, box in zip(tracks, measurements, strict=True)]
+        bound = [(self._candidates[t].quadric, box) for t, box in zip(frame.tracks, frame.boxes, strict=True)]
         known = [(self._graph.quadric(j), box) for j, box in bound if j is not None]
         s = self.settings
         quadrics, boxes = [vector for vector, _ in known], [box for _, box in known]
         return localise(predicted, covariance, quadrics, boxes, self.camera.K, s.robust_scale, s.robust_odometry)
 
-    def give_to_bound(self, k: int, tracks: list[int], measurements: list[BoxMeasurement]) -> int:
-        """Boxes of bound tracks become factors; returns how many."""
+    def add(self, frame: Frame) -> int:
+        """The boxes of the newest keyframe; those of bound tracks go to their quadrics. Returns how many."""
+        k = len(self.frames)
+        self.frames.append(frame)
         used = 0
         T = self._graph.pose(k)
-        for track, box in zip(tracks, measurements, strict=True):
+        for n, (track, box) in enumerate(zip(frame.tracks, frame.boxes, strict=True)):
             candidate = self._candidates[track]
-            if candidate.landmark is None:
+            candidate.seen.append((k, n))
+            if candidate.quadric is None:
                 continue
-            corners = predicted_corners(T, self._graph.quadric(candidate.landmark), self.camera.K, box)
+            corners = predicted_corners(T, self._graph.quadric(candidate.quadric), self.camera.K, box)
             fits = corners is not None and overlap(corners[None], box.corners[None])[0, 0] >= self.LEAST_FIT
-            seen = any(n == k for n, _ in self._graph.landmarks[candidate.landmark].boxes[-2:])
-            if fits and not seen:
-                self._graph.add_box(k, candidate.landmark, box)
-                self.classes[candidate.landmark] += candidate.classes
-                candidate.classes.clear()
+            if fits and self._give(k, n, candidate.quadric):
                 candidate.misfits = 0
                 used += 1
                 continue
@@ -133,46 +149,48 @@ class DataAssociation:
             candidate.misfits += 1
             if candidate.misfits >= self.MAX_MISFITS and self.settings.association != GIVEN:
                 self.counts["unbound"] += 1
-                self._candidates[track] = Candidate(classes=candidate.classes)
+                candidate.quadric, candidate.misfits = None, 0
         return used
 
-    def vote(self, k: int, tracks: list[int], measurements: list[BoxMeasurement], step: Array) -> None:
-        """Open tracks vote for the landmarks that explain their boxes."""
+    def vote(self, k: int, step: Array) -> None:
+        """Open tracks vote for the quadrics that explain their boxes."""
         if self.settings.association == GIVEN:
             return
-        taken = {self._candidates[t].landmark for t in tracks}
-        rows = [i for i, t in enumerate(tracks) if self._candidates[t].landmark is None]
+        frame = self.frames[k]
+        taken = {self._candidates[t].quadric for t in frame.tracks}
+        rows = [n for n, t in enumerate(frame.tracks) if self._candidates[t].quadric is None]
         if not rows:
             return
         T = self._graph.pose(k)
+        open_boxes = [frame.boxes[n] for n in rows]
         near = [
             j
-            for j, landmark in self._graph.landmarks.items()
-            if j not in taken and landmark.factors and self._in_question(T, j, [measurements[i] for i in rows])
+            for j in self._graph.landmarks
+            if j not in taken and self._graph.is_solved(j) and self._in_question(T, j, open_boxes)
         ]
         predictions = []
         for j, covariance in zip(near, self._graph.joint_covariances(k - 1, near), strict=True):
             covariance[:6, :6] += step
-            box = measurements[rows[0]]
-            prediction = predict(T, self._graph.quadric(j), covariance, self.camera.K, box, self.settings.model_error)
+            vector = self._graph.quadric(j)
+            prediction = predict(T, vector, covariance, self.camera.K, open_boxes[0], self.settings.model_error)
             if prediction is not None:
                 predictions.append(Prediction(j, *prediction, self.class_of_quadric(j)))
-        classes = [self._candidates[tracks[i]].classes.most_common(1)[0][0] for i in rows]
-        cost = distances(predictions, [measurements[i] for i in rows], classes, self.settings)
+        classes = [self._candidates[frame.tracks[n]].classes.most_common(1)[0][0] for n in rows]
+        cost = distances(predictions, open_boxes, classes, self.settings)
         for p, r in assign(cost):
-            track = tracks[rows[r]]
-            self._vote_for(track, predictions[p].landmark)
+            self._vote_for(frame.tracks[rows[r]], predictions[p].landmark)
 
     def _vote_for(self, track: int, landmark: int) -> None:
         decided = self._votes.add(track, landmark)
         if decided is not None and not self._seen_apart(self._candidates[track], decided):
             self._bind(track, decided)
 
-    def relocalise(self, k: int, tracks: list[int], measurements: list[BoxMeasurement]) -> None:
+    def relocalise(self, k: int) -> None:
         """Where the boxes show known objects from another pose than the predicted one, vote for those."""
+        tracks, measurements = self.frames[k].tracks, self.frames[k].boxes
         if self.settings.association == GIVEN or not any(self._recent(t, k) for t in tracks):
             return
-        known = [j for j, landmark in self._graph.landmarks.items() if landmark.factors]
+        known = [j for j in self._graph.landmarks if self._graph.is_solved(j)]
         if not known:
             return
         # A young quadric is what is in question: it may be an old one, seen from where the camera is not.
@@ -193,24 +211,26 @@ class DataAssociation:
             return
         self.counts["relocalised"] += 1
         for n, m in found.pairs:
-            bound = self._candidates[tracks[n]].landmark
+            bound = self._candidates[tracks[n]].quadric
             if bound is None:
                 self._vote_for(tracks[n], known[m])
             elif bound != known[m] and self._votes.add(~bound, known[m]) == known[m]:
                 self._same.append((bound, known[m]))
 
-    def start_quadrics(self, tracks: list[int]) -> list[int]:
+    def start_quadrics(self, tracks: Iterable[int]) -> list[int]:
+        """Begin a quadric for each open track whose boxes determine one; returns the new ones."""
         added = []
         for track in tracks:
             candidate = self._candidates[track]
-            if candidate.landmark is not None or len(candidate.boxes) < self.settings.min_boxes:
+            rows = self._open_rows(candidate)
+            if candidate.quadric is not None or len(rows) < self.settings.min_boxes:
                 continue
-            poses = np.stack([self._graph.pose(k) for k, _ in candidate.boxes])
-            boxes = [box for _, box in candidate.boxes]
+            poses = np.stack([self._graph.pose(k) for k, _ in rows])
+            boxes = [self.frames[k].boxes[n] for k, n in rows]
             first = initialise(poses, boxes, self.camera.K, self.settings.robust_scale, self.settings)
             if first is None:
                 continue
-            known = self._known(first.vector, candidate)
+            known = self._same_as(first.vector, candidate)
             if known is not None:
                 self._bind(track, known)
                 continue
@@ -221,7 +241,11 @@ class DataAssociation:
             added.append(j)
         return added
 
-    def _known(self, vector: Array, candidate: Candidate) -> int | None:
+    def start_leftovers(self) -> list[int]:
+        """`start_quadrics` for every open track: with better poses, some determine a quadric that did not before."""
+        return self.start_quadrics([t for t, candidate in self._candidates.items() if candidate.quadric is None])
+
+    def _same_as(self, vector: Array, candidate: Candidate) -> int | None:
         """The quadric that this one is, if the map has it."""
         if self.settings.association == GIVEN:
             return None
@@ -238,6 +262,73 @@ class DataAssociation:
             ):
                 best, nearest = j, distance
         return best
+
+    def revise(self, number: int | None = None) -> int:
+        """Judge anew whose the boxes of earlier keyframes are; returns how many changed hands.
+
+        Args:
+            number: of keyframes, taken in turn; None: all.
+        """
+        if self.settings.association == GIVEN:
+            return 0
+        ids = [j for j in self._graph.landmarks if self._graph.is_solved(j)]
+        if not ids:
+            return 0
+        quadrics = np.stack([self._graph.quadric(j) for j in ids])
+        settled = len(self.frames) - (self.UNSETTLED if number is not None else 0)
+        if number is None:
+            turn: Iterable[int] = range(len(self.frames))
+        else:
+            turn = (
+                [k % settled for k in range(self._revised, self._revised + min(number, settled))] if settled > 0 else []
+            )
+            self._revised = (turn[-1] + 1) % settled if turn else 0
+        changed = 0
+        for k in turn:
+            changed += self._revise_frame(k, ids, quadrics)
+        for j in [j for j in ids if j not in self._known and len(self._graph.landmarks[j].boxes) < self.LEAST_BOXES]:
+            self._graph.remove_quadric(j)
+            self._forget(j)
+            self.counts["quadrics_revised_away"] += 1
+        self.counts["revised"] += changed
+        return changed
+
+    def _revise_frame(self, k: int, ids: list[int], quadrics: Array) -> int:
+        frame = self.frames[k]
+        by_track = [
+            Counter(j for i, m in self._candidates[t].seen if (j := self.frames[i].quadrics[m]) is not None)
+            for t in frame.tracks
+        ]
+        revised = revise(
+            self._graph.pose(k),
+            frame.boxes,
+            frame.classes,
+            by_track,
+            quadrics,
+            ids,
+            [self.classes[j] for j in ids],
+            self.camera.K,
+            (self.camera.width, self.camera.height),
+            self.settings,
+        )
+        changed = [n for n, (old, new) in enumerate(zip(frame.quadrics, revised, strict=True)) if old != new]
+        for n in changed:
+            self._take(k, n)
+        for n in changed:
+            if (j := revised[n]) is not None:
+                self._give(k, n, j)
+        for n in changed:
+            self._rebind(frame.tracks[n])
+        return len(changed)
+
+    def _rebind(self, track: int) -> None:
+        """A track belongs to the quadric that most of its boxes are given to."""
+        candidate = self._candidates[track]
+        given = Counter(j for k, n in candidate.seen if (j := self.frames[k].quadrics[n]) is not None)
+        if given:
+            j, number = given.most_common(1)[0]
+            if number >= self.settings.votes and 2 * number > len(candidate.seen):
+                candidate.quadric = j
 
     def merge(self) -> list[int]:
         """Quadrics that have become one object; the younger goes."""
@@ -258,60 +349,90 @@ class DataAssociation:
 
     def _older_twin(self, j: int) -> int | None:
         """An older quadric that is the same object: of its place, size and class, and never seen beside it."""
-        vector, boxes = self._graph.quadric(j), self._graph.landmarks[j].boxes
+        vector, frames = self._graph.quadric(j), self._graph.landmarks[j].boxes.keys()
         for i in sorted(self._graph.landmarks):
             if i >= j:
                 break
             if (
                 same_object(vector, self._graph.quadric(i), self.settings.merge_distance)
                 and self.class_of_quadric(i) == self.class_of_quadric(j)
-                and not _apart(boxes, self._graph.landmarks[i].boxes)
+                and not _apart(frames, self._graph.landmarks[i].boxes.keys())
             ):
                 return i
         return None
 
     def note(self, report: UpdateReport) -> None:
-        """Book what the graph took out: its tracks are open again."""
-        self.counts["quadrics_removed"] += len(report.removed)
+        """Book what the graph took out: its boxes and tracks are open again."""
         self.counts["repairs"] += bool(report.repaired)
-        for candidate in self._candidates.values():
-            if candidate.landmark is not None and candidate.landmark not in self._graph.landmarks:
-                candidate.landmark = None
+        for j in [j for j in self.classes if j not in self._graph.landmarks]:
+            self.counts["quadrics_removed"] += 1
+            self._forget(j)
 
-    def _bind(self, track: int, landmark: int) -> None:
-        """The track's boxes are of this quadric: those it has and those to come."""
+    def _forget(self, j: int) -> None:
+        """A quadric is no more."""
+        del self.classes[j]
+        for frame in self.frames:
+            frame.quadrics = [None if quadric == j else quadric for quadric in frame.quadrics]
+        for candidate in self._candidates.values():
+            if candidate.quadric == j:
+                candidate.quadric = None
+
+    def _give(self, k: int, n: int, j: int) -> bool:
+        """Box n of keyframe k is of quadric j; False if that has another box there."""
+        frame = self.frames[k]
+        if k in self._graph.landmarks[j].boxes:
+            return False
+        frame.quadrics[n] = j
+        self._graph.add_box(k, j, frame.boxes[n])
+        self.classes[j][frame.classes[n]] += 1
+        return True
+
+    def _take(self, k: int, n: int) -> None:
+        """Box n of keyframe k is open again."""
+        frame = self.frames[k]
+        j = frame.quadrics[n]
+        if j is not None:
+            frame.quadrics[n] = None
+            self._graph.remove_box(k, j)
+            self.classes[j][frame.classes[n]] -= 1
+
+    def _bind(self, track: int, j: int) -> None:
+        """The track's boxes are of this quadric: those that are open and those to come."""
         candidate = self._candidates[track]
-        for k, box in candidate.boxes:
-            self._graph.add_box(k, landmark, box)
-        self.classes.setdefault(landmark, Counter()).update(candidate.classes)
-        self._candidates[track] = Candidate(landmark=landmark)
+        self.classes.setdefault(j, Counter())
+        for k, n in self._open_rows(candidate):
+            self._give(k, n, j)
+        candidate.quadric, candidate.misfits = j, 0
         self._votes.forget(track)
         self.counts["bound"] += 1
 
     def _unite(self, j: int, target: int) -> None:
         """Quadric j is the same object as another, which gets its boxes."""
-        boxes = list(self._graph.landmarks[j].boxes)
-        self._graph.remove_quadric(j)
-        seen = {k for k, _ in self._graph.landmarks[target].boxes}
-        for k, box in boxes:
-            if k not in seen:
-                self._graph.add_box(k, target, box)
-        self.classes[target] += self.classes.pop(j)
+        for k in list(self._graph.landmarks[j].boxes):
+            n = self.frames[k].quadrics.index(j)
+            self._take(k, n)
+            self._give(k, n, target)
         for candidate in self._candidates.values():
-            if candidate.landmark == j:
-                candidate.landmark = target
+            if candidate.quadric == j:
+                candidate.quadric = target
+        self._graph.remove_quadric(j)
+        del self.classes[j]
         self.counts["merged"] += 1
+
+    def _open_rows(self, candidate: Candidate) -> list[tuple[int, int]]:
+        """Boxes of a track, (keyframe, row), that are given to no quadric."""
+        return [(k, n) for k, n in candidate.seen if self.frames[k].quadrics[n] is None]
 
     def _class_of(self, track: int) -> str:
         """The class most boxes of a track, or of the quadric it is bound to, carry."""
         candidate = self._candidates[track]
-        if candidate.landmark is not None:
-            return self.class_of_quadric(candidate.landmark)
+        if candidate.quadric is not None:
+            return self.class_of_quadric(candidate.quadric)
         return candidate.classes.most_common(1)[0][0]
 
     def _recent(self, track: int, k: int) -> bool:
         """Whether a track is open, or bound to a young quadric."""
-        landmark = self._candidates[track].landmark
+        landmark = self._candidates[track].quadric
         return landmark is None or k - self._graph.landmarks[landmark].born <= self.YOUNG
 
     def _in_question(self, T_map_camera: Array, j: int, boxes: list[BoxMeasurement]) -> bool:
@@ -322,11 +443,9 @@ class DataAssociation:
 
     def _seen_apart(self, candidate: Candidate, landmark: int) -> bool:
         """Whether an image shows both the track and the landmark, as two boxes."""
-        return _apart(candidate.boxes, self._graph.landmarks[landmark].boxes)
+        return _apart({k for k, _ in self._open_rows(candidate)}, self._graph.landmarks[landmark].boxes.keys())
 
 
-def _apart(a: list[tuple[int, BoxMeasurement]], b: list[tuple[int, BoxMeasurement]]) -> bool:
-    """Whether two lists of boxes share more than a tenth of the keyframes of the shorter: then they are two objects."""
-    frames_a, frames_b = {k for k, _ in a}, {k for k, _ in b}
-    shared = len(frames_a & frames_b)
-    return shared > 0.1 * min(len(frames_a), len(frames_b))
+def _apart(a: Set[int], b: Set[int]) -> bool:
+    """Whether two objects share more than a tenth of the keyframes of the shorter: then they are two."""
+    return len(a & b) > 0.1 * min(len(a), len(b))

@@ -24,7 +24,7 @@ from calibslam_backend.association import GIVEN
 from calibslam_backend.box_measurement import undistorted
 from calibslam_backend.data_association import DataAssociation
 from calibslam_backend.estimator_settings import EstimatorSettings
-from calibslam_backend.graph import ObjectGraph
+from calibslam_backend.graph import Motion, ObjectGraph
 from calibslam_backend.kernels import load_kernels
 from calibslam_backend.object_map import ObjectMap
 from calibslam_backend.odometry import MotionChain
@@ -68,6 +68,8 @@ class Keyframe:
 class Estimator:
     """Incremental object SLAM of one camera."""
 
+    ROUNDS = 5  # of association and optimisation at the end
+
     def __init__(self, camera: Camera, T_body_camera: Array, settings: EstimatorSettings) -> None:
         load_kernels()
         self.camera = camera
@@ -81,12 +83,11 @@ class Estimator:
         self.stamps: list[int] = []
         self._motions = MotionChain(self.settings, self._T_body_camera)
         self._tracker = Tracker(self.settings, self.camera.K)
-        self._graph = ObjectGraph(self.camera.K, self.settings, self.settings)
+        self._graph = ObjectGraph(self.camera.K, self.settings, self.settings, self.settings)
         self._objects = DataAssociation(self._graph, self.camera, self.settings, self.counts)
         self._given: dict[str, int] = {}
         self._waiting: list[tuple[int, int, Boxes]] = []
         self._last_frame: int | None = None
-        self.associations: list[tuple[int, str]] = []  # track and true identity of each box of a keyframe
 
     # -- measurements in ----------------------------------------------------------------------------------------
 
@@ -137,6 +138,16 @@ class Estimator:
         """Relinearise until nothing moves any more: the best estimate of all that was seen."""
         if not self.stamps:
             return
+        for _ in range(self.ROUNDS):
+            changed = self._objects.revise()
+            self._objects.start_leftovers()
+            self._converge(iterations)
+            self._objects.merge()
+            if not changed:
+                break
+        self._converge(iterations)
+
+    def _converge(self, iterations: int) -> None:
         for _ in range(iterations):
             before = self._graph.poses()
             self._objects.note(self._graph.update(everything=True))
@@ -221,9 +232,10 @@ class Estimator:
             classes = Counter({quadric.class_id: max(quadric.observations, 1)})
             self._objects.know(quadric.id, vector, covariance, classes)
 
-    def quadric_of_track(self, track: int) -> int | None:
-        """The quadric a track is bound to."""
-        return self._objects.quadric_of_track(track)
+    def associations(self) -> list[tuple[int | None, str]]:
+        """For each box of a keyframe the quadric it is given to, and its true identity ("": unknown)."""
+        frames = self._objects.frames
+        return [pair for frame in frames for pair in zip(frame.quadrics, frame.names, strict=True)]
 
     def optimise(self) -> None:
         """Move the whole graph to its batch optimum."""
@@ -251,12 +263,13 @@ class Estimator:
             turned = self._motions.between(self._last_frame, boxes.stamp)[0][:3, :3].T
         self._last_frame = boxes.stamp
         boxes, tracks = self._tracks(boxes, turned)
-        motion, covariance = np.eye(4), np.eye(6)
+        motion = None
         if self.stamps:
-            motion, covariance = self._motions.between(self.stamps[-1], boxes.stamp)
-            if not self._moved(motion, boxes.stamp - self.stamps[-1]):
+            interval = self.stamps[-1], boxes.stamp
+            motion = Motion(*self._motions.between(*interval), self._motions.drifts(*interval))
+            if not self._moved(motion.T, boxes.stamp - self.stamps[-1]):
                 return None
-        return self._keyframe(boxes, tracks, motion, covariance, began)
+        return self._keyframe(boxes, tracks, motion, began)
 
     def _tracks(self, boxes: Boxes, R_now_before: Array) -> tuple[Boxes, list[int]]:
         """The boxes that belong to a track, and the number of that track."""
@@ -284,27 +297,26 @@ class Estimator:
             or duration >= s.keyframe_interval * SECOND
         )
 
-    def _keyframe(self, boxes: Boxes, tracks: list[int], motion: Array, covariance: Array, began: float) -> Keyframe:
+    def _keyframe(self, boxes: Boxes, tracks: list[int], motion: Motion | None, began: float) -> Keyframe:
         objects = self._objects
-        measurements = objects.measurements(boxes, tracks)
+        frame = objects.frame(boxes, tracks)
         k = len(self.stamps)
-        if k:
-            guess = objects.localise(tracks, measurements, self._graph.pose(k - 1) @ motion, covariance)
-            self._graph.add_pose(motion, covariance, guess)
-        else:
+        if motion is None:
             self._graph.add_origin()
+        else:
+            guess = objects.localise(frame, self._graph.predict(motion), motion.covariance)
+            self._graph.add_pose(motion, guess)
         self.stamps.append(boxes.stamp)
         self._motions.forget_before(boxes.stamp)
-        used = objects.give_to_bound(k, tracks, measurements)
-        if k:
-            objects.vote(k, tracks, measurements, covariance)
-            objects.relocalise(k, tracks, measurements)
-        objects.keep_open(k, tracks, measurements)
+        used = objects.add(frame)
+        if motion is not None:
+            objects.vote(k, motion.covariance)
+            objects.relocalise(k)
         added = objects.start_quadrics(tracks)
         report = self._graph.update()
         self._objects.note(report)
         removed = report.removed + objects.merge()
-        self.associations += list(zip(tracks, boxes.object_ids, strict=True))
+        objects.revise(self.settings.revised)
         return Keyframe(
             k,
             boxes.stamp,

@@ -1,6 +1,7 @@
 """The factor graph of camera poses and quadrics, solved incrementally by ISAM2 (document, eq. 2.3.5 and 4.3.3).
 
-Keys: x(k) pose of keyframe k; q(j) quadric j, a vector of centre and logarithmic shape (see `quadric`).
+Keys: x(k) pose of keyframe k; q(j) quadric j, a vector of centre and logarithmic shape (see `quadric`); d(0) the
+drift of odometry (see `odometry_factor`), where its covariance is unknown.
 
 A graph never stays broken. A quadric that runs away is taken out, an update that fails is repaired by building
 the tree anew without the quadric at fault, and both are reported.
@@ -9,6 +10,7 @@ the tree anew without the quadric at fault, and both are reported.
 from __future__ import annotations
 
 import logging
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 
 import gtsam
@@ -18,8 +20,10 @@ from gtsam import symbol
 from calibslam_backend.box_factor import box_factor
 from calibslam_backend.box_measurement import BoxMeasurement
 from calibslam_backend.initialisation import InitialisationSettings
-from calibslam_backend.odometry import dead_reckoning
+from calibslam_backend.odometry import MotionNoise, dead_reckoning
+from calibslam_backend.odometry_factor import DRIFT, motion_factor
 from calibslam_backend.quadric import matrix_from_vector
+from calibslam_backend.smoother import Smoother
 from calibslam_msgs_py.measurements import Array
 from calibslam_msgs_py.settings import Settings, setting
 
@@ -35,10 +39,8 @@ T_MAP_FIRST_CAMERA = np.array(
 
 @dataclass(frozen=True)
 class GraphSettings(Settings):
-    robust_scale: float = setting(2.0, "Mahalanobis distance from which a box counts as doubtful", low=0.1, high=1e6)
-    robust_odometry: float = setting(
-        3.0, "Mahalanobis distance from which a motion counts as doubtful", low=0.1, high=1e6
-    )
+    robust_scale: float = setting(2.0, "Mahalanobis distance beyond which a box is doubted", low=0.1, high=1e6)
+    robust_odometry: float = setting(3.5, "Mahalanobis distance beyond which a motion is doubted", low=0.1, high=1e6)
     prior_sigma: float = setting(0.001, "first pose: it is the map's origin", unit="rad and m", low=1e-6)
     relinearise_every: int = setting(3, "keyframes between relinearisations of the whole graph", low=1)
     relinearise_pose: float = setting(0.01, "change of a pose that asks for one", unit="rad and m", low=0.0)
@@ -46,20 +48,26 @@ class GraphSettings(Settings):
     young: int = setting(20, "keyframes during which a quadric is relinearised at once", low=0)
 
 
+@dataclass(frozen=True)
+class Motion:
+    """Between consecutive poses: (4, 4) as measured, its covariance (6, 6), and the time [s] during which it drifts."""
+
+    T: Array
+    covariance: Array
+    drifts: float
+
+
 @dataclass
 class Landmark:
-    """What the graph knows of a quadric: its prior (vector and covariance), its boxes by keyframe, its factors."""
+    """What the graph knows of a quadric: the keyframe it was born in, and its boxes by keyframe."""
 
-    prior: Array
-    covariance: Array
     born: int
-    boxes: list[tuple[int, BoxMeasurement]] = field(default_factory=list)
-    factors: list[int] = field(default_factory=list)
+    boxes: dict[int, BoxMeasurement] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
 class UpdateReport:
-    """What an update did: quadrics that run away and will be taken out by the next, and why the tree was built anew."""
+    """What an update did: quadrics that ran away and are taken out with the next, and why the tree was built anew."""
 
     removed: list[int]
     repaired: str = ""
@@ -71,20 +79,21 @@ class ObjectGraph:
     # A quadric beyond these is no object any more [m].
     LARGEST_RADIUS, LARGEST_DISTANCE, SMALLEST_RADIUS = 10.0, 200.0, 1e-4
     LARGEST_STEP = 0.5  # [rad, m] of a pose in one update; more is checked by a damped optimisation
-    BATCH_ITERATIONS, REPAIR_ITERATIONS = 100, 15
-    CONVERGED = 1e-4  # share by which an iteration has to lower the error
+    REPAIR_ITERATIONS = 15
 
-    def __init__(self, K: Array, settings: GraphSettings, priors: InitialisationSettings) -> None:
+    def __init__(self, K: Array, settings: GraphSettings, priors: InitialisationSettings, noise: MotionNoise) -> None:
         self._K = np.ascontiguousarray(K, float)
         self._settings = settings
         self._prior = priors.prior_covariance()
+        self._drift_sigmas = np.repeat([noise.drift_rotation, noise.drift_translation], 3)
+        self._drifts = False
         self._has_origin = False
-        self._motions: list[tuple[Array, Array]] = []  # between consecutive poses, with covariance
+        self._motions: list[Motion] = []
         self.landmarks: dict[int, Landmark] = {}
         self._origin = gtsam.Pose3(T_MAP_FIRST_CAMERA)
-        self._isam = self._new_isam()
-        self._begin_change()
-        self._values = gtsam.Values()
+        # The factors are linear in the drift: there is nothing to relinearise.
+        pose, quadric = settings.relinearise_pose, settings.relinearise_quadric
+        self._smoother = Smoother({"x": (6, pose), "q": (9, quadric), "d": (DRIFT, np.inf)})
         self._updates = 0
 
     # -- what is in it ------------------------------------------------------------------------------------------
@@ -96,7 +105,7 @@ class ObjectGraph:
 
     def pose(self, k: int) -> Array:
         """(4, 4) T_map_camera of keyframe k."""
-        return np.asarray(self._values.atPose3(symbol("x", k)).matrix())
+        return np.asarray(self._smoother.values.atPose3(_x(k)).matrix())
 
     def poses(self) -> Array:
         """(N, 4, 4) of all keyframes."""
@@ -104,52 +113,71 @@ class ObjectGraph:
 
     def odometry(self) -> tuple[Array, Array]:
         """What odometry alone says: poses (N, 4, 4) and their covariances (N, 6, 6), from the same origin."""
-        return dead_reckoning(self._origin.matrix(), np.eye(6) * self._settings.prior_sigma**2, self._motions)
+        steps = [(motion.T, motion.covariance) for motion in self._motions]
+        return dead_reckoning(self._origin.matrix(), np.eye(6) * self._settings.prior_sigma**2, steps)
+
+    def drift(self) -> Array:
+        """(6,) velocity [rad/s, m/s] that odometry misses; zero while nothing is known of it."""
+        return np.asarray(self._smoother.values.atVector(_D)) if self._drifts else np.zeros(DRIFT)
+
+    def predict(self, motion: Motion) -> Array:
+        """(4, 4) T_map_camera after a motion from the newest pose."""
+        correction = gtsam.Pose3.Expmap(motion.drifts * self.drift())
+        return np.asarray(self.pose(self.size - 1) @ motion.T @ correction.matrix())
 
     def quadric(self, j: int) -> Array:
         """(9,) centre and logarithmic shape."""
-        return np.asarray(self._values.atVector(symbol("q", j)))
+        return np.asarray(self._smoother.values.atVector(_q(j)))
+
+    def is_solved(self, j: int) -> bool:
+        """Whether a quadric has gone through an update, and so has covariances."""
+        return self._smoother.has(("prior", j))
 
     def pose_covariance(self, k: int) -> Array:
         """(6, 6) [rotation, translation] of keyframe k in its body."""
-        return np.asarray(self._isam.marginalCovariance(symbol("x", k)))
+        return self._smoother.marginal(_x(k))
 
     def quadric_covariances(self) -> dict[int, Array]:
         """For each quadric (9, 9) of its vector."""
-        keys = {j: symbol("q", j) for j in self.landmarks}
-        if not keys:
+        if not self.landmarks:
             return {}
-        # One call for all: each costs a solve over the tree between its variables.
-        joint = self._isam.jointMarginalCovariance(list(keys.values()))
-        return {j: np.asarray(joint.at(key, key)) for j, key in keys.items()}
+        joint = self._smoother.joint([_q(j) for j in self.landmarks])
+        return {j: np.asarray(joint.at(_q(j), _q(j))) for j in self.landmarks}
 
     def joint_covariances(self, k: int, quadrics: list[int]) -> list[Array]:
         """For each of these quadrics (15, 15) of pose k and the quadric: columns of `quadric.box_of_visible_part`."""
         if not quadrics:
             return []
-        keys = [symbol("x", k), *(symbol("q", j) for j in quadrics)]
-        joint = self._isam.jointMarginalCovariance(keys)
-        return [np.block([[joint.at(a, b) for b in (keys[0], q)] for a in (keys[0], q)]) for q in keys[1:]]
+        x = _x(k)
+        joint = self._smoother.joint([x, *map(_q, quadrics)])
+        return [np.block([[joint.at(a, b) for b in (x, q)] for a in (x, q)]) for q in map(_q, quadrics)]
 
     # -- changes, which take effect with the next update --------------------------------------------------------
 
     def add_origin(self) -> None:
         """The first pose."""
         self._has_origin = True
-        self._add_origin_factor()
-        for values in (self._new_values, self._values):
-            values.insert(symbol("x", 0), self._origin)
+        noise = gtsam.noiseModel.Isotropic.Sigma(6, self._settings.prior_sigma)
+        self._smoother.insert(_x(0), self._origin)
+        self._smoother.add("origin", gtsam.PriorFactorPose3(_x(0), self._origin, noise))
 
-    def add_pose(self, motion: Array, covariance: Array, guess: Array) -> int:
-        """The next pose, after a motion (4, 4) from the last one with covariance (6, 6); returns its number.
+    def add_pose(self, motion: Motion, guess: Array) -> int:
+        """The next pose, after a motion from the last one; returns its number.
 
         The optimisation starts from `guess` (4, 4), its pose in the map.
         """
         k = self.size
-        self._motions.append((motion, covariance))
-        self._add_motion_factor(k)
-        for values in (self._new_values, self._values):
-            values.insert(symbol("x", k), gtsam.Pose3(guess))
+        self._motions.append(motion)
+        if motion.drifts and not self._drifts:
+            self._drifts = True
+            noise = gtsam.noiseModel.Diagonal.Sigmas(self._drift_sigmas)
+            self._smoother.insert(_D, np.zeros(DRIFT))
+            self._smoother.add("drift", gtsam.PriorFactorVector(_D, np.zeros(DRIFT), noise))
+        self._smoother.insert(_x(k), gtsam.Pose3(guess))
+        factor = motion_factor(
+            _x(k - 1), _x(k), _D, motion.T, motion.covariance, motion.drifts, self._settings.robust_odometry
+        )
+        self._smoother.add(("motion", k), factor)
         return k
 
     def add_quadric(self, j: int, vector: Array) -> None:
@@ -158,37 +186,39 @@ class ObjectGraph:
 
     def add_known_quadric(self, j: int, vector: Array, covariance: Array) -> None:
         """A quadric that is known as well as this covariance (9, 9) says."""
-        self.landmarks[j] = Landmark(vector, covariance, self.size)
-        for values in (self._new_values, self._values):
-            values.insert(symbol("q", j), vector)
-        self._add_prior_factor(j)
+        self.landmarks[j] = Landmark(self.size)
+        noise = gtsam.noiseModel.Gaussian.Covariance(covariance)
+        self._smoother.insert(_q(j), vector)
+        self._smoother.add(("prior", j), gtsam.PriorFactorVector(_q(j), vector, noise))
 
     def add_box(self, k: int, j: int, box: BoxMeasurement) -> None:
-        """A box of quadric j in keyframe k."""
-        self.landmarks[j].boxes.append((k, box))
-        self._add_box_factor(k, j, box)
+        """A box of quadric j in keyframe k, which must be its only one there."""
+        factor = box_factor(_x(k), _q(j), box, self._K, self._settings.robust_scale)
+        self._smoother.add(("box", k, j), factor)
+        self.landmarks[j].boxes[k] = box
+
+    def remove_box(self, k: int, j: int) -> None:
+        """The box of quadric j in keyframe k is of something else."""
+        del self.landmarks[j].boxes[k]
+        self._smoother.remove(("box", k, j))
 
     def remove_quadric(self, j: int) -> None:
-        """Take a quadric out, with all that was measured of it.
-
-        Raises:
-            ValueError: something of it waits for the update.
-        """
-        if j in self._owners:
-            raise ValueError(f"quadric {j} has factors that wait for the update")
-        landmark = self.landmarks.pop(j)
-        self._to_remove += landmark.factors
-        self._values.erase(symbol("q", j))
+        """Take a quadric out, with all that was measured of it."""
+        for k in self.landmarks.pop(j).boxes:
+            self._smoother.remove(("box", k, j))
+        self._smoother.remove(("prior", j))
+        self._smoother.forget(_q(j))
 
     # -- solving ------------------------------------------------------------------------------------------------
 
     def update(self, everything: bool = False) -> UpdateReport:
         """One step of ISAM2; `everything` relinearises whatever has moved."""
         self._updates += 1
-        before = gtsam.Values(self._values)
+        before = gtsam.Values(self._smoother.values)
+        relinearise = everything or self._updates % self._settings.relinearise_every == 0
         reason = ""
         try:
-            self._step(everything or self._updates % self._settings.relinearise_every == 0)
+            self._smoother.update(self._last(), () if relinearise else self._settled())
             if self._jumped(before):
                 reason = "the trajectory jumped"
         except RuntimeError as error:
@@ -204,39 +234,19 @@ class ObjectGraph:
 
     def optimise(self) -> None:
         """The batch optimum by Levenberg-Marquardt, from which the tree is built anew."""
-        self._rebuild(self._levenberg_marquardt(self._values, self.BATCH_ITERATIONS))
+        self._smoother.rebuild(self._smoother.optimise(self._smoother.values), self._last())
 
-    def _step(self, everything: bool) -> None:
-        changes = gtsam.ISAM2UpdateParams()
-        changes.removeFactorIndices = self._to_remove
-        changes.constrainedKeys = self._order()
-        changes.force_relinearize = True
-        if not everything:
-            changes.noRelinKeys = self._settled()
-        result = self._isam.update(self._new_factors, self._new_values, changes)
-        for owner, index in zip(self._owners, result.getNewFactorsIndices(), strict=True):
-            if owner in self.landmarks:
-                self.landmarks[owner].factors.append(index)
-        self._begin_change()
-        self._values = self._isam.calculateEstimate()
+    def _last(self) -> list[int]:
+        """Quadrics, the drift and the newest pose are eliminated last: the next update will touch them again."""
+        drift = [_D] if self._drifts else []
+        return [*map(_q, self.landmarks), _x(self.size - 1), *drift]
 
-    def _order(self) -> gtsam.KeyGroupMap:
-        """Quadrics and the newest pose are eliminated last: the next update will touch them again."""
-        groups = gtsam.KeyGroupMap()
-        for j in self.landmarks:
-            groups.insert2(symbol("q", j), 1)
-        groups.insert2(symbol("x", self.size - 1), 1)
-        return groups
-
-    def _settled(self) -> gtsam.KeyList:
+    def _settled(self) -> Iterator[int]:
         """Everything but young quadrics and the newest poses keeps its linearisation point for now."""
-        keys = gtsam.KeyList()
-        for k in range(self.size - 5):
-            keys.push_back(symbol("x", k))
+        yield from map(_x, range(self.size - 5))
         for j, landmark in self.landmarks.items():
             if self.size - landmark.born > self._settings.young:
-                keys.push_back(symbol("q", j))
-        return keys
+                yield _q(j)
 
     def _sane(self, j: int) -> bool:
         vector = self.quadric(j)
@@ -251,8 +261,9 @@ class ObjectGraph:
 
     def _jumped(self, before: gtsam.Values) -> bool:
         """Whether a pose moved farther than an undamped step can be trusted with."""
+        now = self._smoother.values
         for k in range(self.size):
-            step = gtsam.Pose3.Logmap(before.atPose3(symbol("x", k)).between(self._values.atPose3(symbol("x", k))))
+            step = gtsam.Pose3.Logmap(before.atPose3(_x(k)).between(now.atPose3(_x(k))))
             if not np.isfinite(step).all() or np.abs(step).max() > self.LARGEST_STEP:
                 return True
         return False
@@ -264,88 +275,27 @@ class ObjectGraph:
         """
         while True:
             try:
-                self._rebuild(self._levenberg_marquardt(before, self.REPAIR_ITERATIONS))
+                values = self._smoother.optimise(before, self.REPAIR_ITERATIONS)
+                self._smoother.rebuild(values, self._last())
                 return
             except RuntimeError as error:
                 if not self.landmarks:
                     raise
                 youngest = max(self.landmarks, key=lambda j: self.landmarks[j].born)
                 log.warning("%s; giving up quadric %d", _first_sentence(error), youngest)
-                del self.landmarks[youngest]
-                before.erase(symbol("q", youngest))
+                self.remove_quadric(youngest)
+                before.erase(_q(youngest))
 
-    def _levenberg_marquardt(self, values: gtsam.Values, iterations: int) -> gtsam.Values:
-        self._begin_change()
-        self._add_all_factors()
-        optimiser = gtsam.LevenbergMarquardtOptimizer(self._new_factors, values, gtsam.LevenbergMarquardtParams())
-        error = optimiser.error()
-        for _ in range(iterations):  # one at a time, so that other threads of the process are served in between
-            optimiser.iterate()
-            if error - optimiser.error() < self.CONVERGED * error:
-                break
-            error = optimiser.error()
-        return optimiser.values()
 
-    def _rebuild(self, values: gtsam.Values) -> None:
-        """A new tree of all factors, linearised at these values."""
-        self._isam = self._new_isam()
-        self._begin_change()
-        self._add_all_factors()
-        self._new_values = values
-        for landmark in self.landmarks.values():
-            landmark.factors = []
-        self._step(True)
+def _x(k: int) -> int:
+    return int(symbol("x", k))
 
-    def _add_all_factors(self) -> None:
-        self._add_origin_factor()
-        for k in range(1, self.size):
-            self._add_motion_factor(k)
-        for j, landmark in self.landmarks.items():
-            self._add_prior_factor(j)
-            for k, box in landmark.boxes:
-                self._add_box_factor(k, j, box)
 
-    def _new_isam(self) -> gtsam.ISAM2:
-        parameters = gtsam.ISAM2Params()
-        parameters.relinearizeSkip = 1  # `update` says itself what may be relinearised
-        thresholds = gtsam.ISAM2ThresholdMap()
-        pose, quadric = self._settings.relinearise_pose, self._settings.relinearise_quadric
-        for name, size, threshold in (("x", 6, pose), ("q", 9, quadric)):
-            thresholds.insert((name, np.full(size, threshold)))
-        parameters.setRelinearizeThreshold(thresholds)
-        return gtsam.ISAM2(parameters)
+def _q(j: int) -> int:
+    return int(symbol("q", j))
 
-    # -- factors ------------------------------------------------------------------------------------------------
 
-    def _begin_change(self) -> None:
-        self._new_factors = gtsam.NonlinearFactorGraph()
-        self._new_values = gtsam.Values()
-        self._owners: list[int] = []  # of each new factor: the quadric, or -1
-        self._to_remove: list[int] = []
-
-    def _add(self, factor: gtsam.NonlinearFactor, owner: int = -1) -> None:
-        self._new_factors.push_back(factor)
-        self._owners.append(owner)
-
-    def _add_origin_factor(self) -> None:
-        noise = gtsam.noiseModel.Isotropic.Sigma(6, self._settings.prior_sigma)
-        self._add(gtsam.PriorFactorPose3(symbol("x", 0), self._origin, noise))
-
-    def _add_motion_factor(self, k: int) -> None:
-        motion, covariance = self._motions[k - 1]
-        noise = gtsam.noiseModel.Robust.Create(
-            gtsam.noiseModel.mEstimator.Cauchy.Create(self._settings.robust_odometry),
-            gtsam.noiseModel.Gaussian.Covariance(covariance),
-        )
-        self._add(gtsam.BetweenFactorPose3(symbol("x", k - 1), symbol("x", k), gtsam.Pose3(motion), noise))
-
-    def _add_prior_factor(self, j: int) -> None:
-        landmark = self.landmarks[j]
-        noise = gtsam.noiseModel.Gaussian.Covariance(landmark.covariance)
-        self._add(gtsam.PriorFactorVector(symbol("q", j), landmark.prior, noise), j)
-
-    def _add_box_factor(self, k: int, j: int, box: BoxMeasurement) -> None:
-        self._add(box_factor(symbol("x", k), symbol("q", j), box, self._K, self._settings.robust_scale), j)
+_D = int(symbol("d", 0))
 
 
 def _first_sentence(error: RuntimeError) -> str:

@@ -14,9 +14,10 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from calibslam_backend.box_factor import INVISIBLE, robust_loss, whitened_residual
+from calibslam_backend.box_factor import INVISIBLE, whitened_residual
 from calibslam_backend.box_measurement import BoxMeasurement
 from calibslam_backend.quadric import Ellipsoid
+from calibslam_backend.robust import robust_loss
 from calibslam_msgs_py.measurements import Array
 from calibslam_msgs_py.settings import Settings, setting
 

@@ -13,6 +13,7 @@ from calibslam_backend.initialisation import InitialisationSettings, initialise
 from calibslam_backend.localisation import localise
 from calibslam_backend.quadric import ALL_EDGES, Ellipsoid, box_of_visible_part
 from calibslam_backend.relocalisation import overlaps_at
+from calibslam_backend.revision import squared_distances
 
 
 @functools.cache
@@ -35,4 +36,8 @@ def load_kernels() -> None:
     overlaps_at(
         np.eye(4), vector[None, :3].copy(), np.eye(3)[None], K, bounds[2:].copy(), bounds[None].copy(), everything
     )
+    squared_distances(
+        np.eye(4), vector[None], K, bounds[2:].copy(), bounds[None].copy(), np.eye(4)[None], bounds[None].copy(),
+        ~ALL_EDGES[None], 0.1
+    )  # fmt: skip
     localise(poses[0].matrix(), np.eye(6), [values.atVector(1)], boxes[:1], K, 1.0, 1.0)

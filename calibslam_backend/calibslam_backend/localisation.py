@@ -11,8 +11,9 @@ import gtsam
 import numba
 import numpy as np
 
-from calibslam_backend.box_factor import INVISIBLE, robust_loss, whitened_residual
+from calibslam_backend.box_factor import INVISIBLE, whitened_residual
 from calibslam_backend.box_measurement import BoxMeasurement
+from calibslam_backend.robust import robust_loss
 from calibslam_msgs_py.measurements import Array
 
 # The second start believes odometry this much less: its standard deviations times ten.

@@ -1,7 +1,8 @@
 """Relative motions from odometry, and what is believed of them.
 
 Odometry covariances are often missing. `MotionNoise` then stands in: a share of the motion itself plus a floor,
-which is what frame-to-frame visual odometry was seen to do on recordings of slow and fast motion alike.
+which is what frame-to-frame visual odometry was seen to do on recordings of slow and fast motion alike, and a
+constant part, which the graph estimates (see `odometry_factor`).
 """
 
 from __future__ import annotations
@@ -19,12 +20,17 @@ from calibslam_msgs_py.settings import Settings, setting
 
 @dataclass(frozen=True)
 class MotionNoise(Settings):
-    """Standard deviations of a motion whose covariance is unknown: sqrt(floor^2 + (share * motion)^2)."""
+    """Standard deviations of a motion whose covariance is unknown: sqrt(floor^2 + (share * motion)^2), and those of
+    the drift that all such motions share."""
 
     rotation_floor: float = setting(0.001, "unknown odometry noise: rotation at rest", unit="rad", low=1e-6)
     rotation_share: float = setting(0.04, "unknown odometry noise: share of the rotation", low=0.0, high=1.0)
     translation_floor: float = setting(0.001, "unknown odometry noise: translation at rest", unit="m", low=1e-6)
     translation_share: float = setting(0.06, "unknown odometry noise: share of the translation", low=0.0, high=1.0)
+    drift_rotation: float = setting(0.003, "unknown odometry noise: constant drift in rotation", unit="rad/s", low=1e-9)
+    drift_translation: float = setting(
+        0.003, "unknown odometry noise: constant drift in translation", unit="m/s", low=1e-9
+    )
 
     def covariance(self, T_start_end: Array) -> Array:
         """(6, 6) [rotation, translation] for a motion (4, 4)."""
@@ -174,6 +180,12 @@ class MotionChain:
         """Drop what is not needed to read times from `time` [ns] on."""
         keep = max(bisect_right(self._times, time) - 1, 0)
         del self._times[:keep], self._poses[:keep], self._covariances[:keep]
+
+    def drifts(self, start: int, end: int) -> float:
+        """How long [s] the motion from start to end [ns] drifts: all the time if its covariance is not known."""
+        steps = range(bisect_right(self._times, start), bisect_right(self._times, end - 1) + 1)
+        unknown = any(self._covariances[i] is None for i in steps if i < len(self._times))
+        return (end - start) / SECOND if unknown else 0.0
 
     def clear(self) -> None:
         """Forget everything."""

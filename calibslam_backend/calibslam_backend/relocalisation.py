@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from calibslam_backend.box_measurement import BoxMeasurement
 from calibslam_backend.localisation import fit
-from calibslam_backend.quadric import matrix_from_vector
+from calibslam_backend.quadric import mean_radius, shapes
 from calibslam_msgs_py.measurements import Array
 from calibslam_msgs_py.settings import Settings, setting
 
@@ -71,12 +71,12 @@ def relocalise(
     if len(boxes) < settings.relocalisation_boxes or np.count_nonzero(compatible) < settings.relocalisation_boxes:
         return None
     corners = np.stack([box.corners for box in boxes])
-    shapes, sizes = _shapes(quadrics)
+    surfaces, sizes = shapes(quadrics), np.array([mean_radius(vector) for vector in quadrics])
     size, centres = np.array(image, dtype=np.float64), np.ascontiguousarray(quadrics[:, :3])
 
     def overlaps(T: Array) -> Array:
         # One memory layout for all: numba compiles anew for each.
-        return np.asarray(overlaps_at(np.ascontiguousarray(T), centres, shapes, K, size, corners, compatible))
+        return np.asarray(overlaps_at(np.ascontiguousarray(T), centres, surfaces, K, size, corners, compatible))
 
     def explained(T: Array) -> list[tuple[int, int]]:
         return _one_to_one(overlaps(T), settings.relocalisation_overlap)
@@ -102,16 +102,6 @@ def relocalise(
         if best is not None:
             return best
     return None
-
-
-def _shapes(quadrics: Array) -> tuple[Array, Array]:
-    """S (M, 3, 3) [m^2] and mean radius (M,) [m] of each quadric."""
-    shapes, sizes = np.empty((len(quadrics), 3, 3)), np.empty(len(quadrics))
-    for n, vector in enumerate(quadrics):
-        logarithms, axes = np.linalg.eigh(matrix_from_vector(vector[3:]))
-        shapes[n] = (axes * np.exp(2.0 * logarithms)) @ axes.T
-        sizes[n] = np.exp(logarithms.mean())
-    return shapes, sizes
 
 
 def _points(corners: Array, sizes: Array, K: Array) -> Array:
@@ -174,7 +164,7 @@ def _one_to_one(overlaps: Array, least: float) -> list[tuple[int, int]]:
 
 
 @numba.njit(cache=True)
-def overlaps_at(T, centres, shapes, K, size, corners, compatible):  # type: ignore[no-untyped-def]
+def overlaps_at(T, centres, surfaces, K, size, corners, compatible):  # type: ignore[no-untyped-def]
     """Intersection over union (N, M) of boxes (N, 4) with those that M quadrics have in the image, seen from T (4, 4).
 
     Zero for pairs that are not compatible (N, M).
@@ -185,7 +175,7 @@ def overlaps_at(T, centres, shapes, K, size, corners, compatible):  # type: igno
         c = R.T @ (centres[m] - T[:3, 3])
         if c[2] <= 0.0:
             continue
-        N = R.T @ shapes[m] @ R - np.outer(c, c)
+        N = R.T @ surfaces[m] @ R - np.outer(c, c)
         if N[2, 2] >= 0.0:
             continue
         x, y = N[0, 2] / N[2, 2], N[1, 2] / N[2, 2]

@@ -125,7 +125,7 @@ def run_record(
         boxes_used=estimator.boxes_used,
         boxes_rejected=sum(rejections.values()),
         rejected={**rejections, **{k: n for k, n in counts.items() if not k.startswith("rejected_")}},
-        associations=[(estimator.quadric_of_track(track), name) for track, name in estimator.associations],
+        associations=estimator.associations(),
         wall_s=wall_s,
         sequence_s=sequence_s,
         settings=dataclasses.asdict(estimator.settings),

@@ -101,7 +101,7 @@ def test_quadrics_are_the_objects() -> None:
 
 def test_estimated_identities_are_the_true_ones() -> None:
     e = run(ONCE_AROUND, ESTIMATED)
-    scores = metrics.association_scores([(e.quadric_of_track(t), name) for t, name in e.associations])
+    scores = metrics.association_scores(e.associations())
     assert scores is not None
     assert scores.precision > 0.95 and scores.recall > 0.9
 

@@ -6,8 +6,10 @@ import gtsam
 import numpy as np
 from small_world import CAMERA, SmallWorld, around, objects
 
+from calibslam_backend.box_factor import INVISIBLE, whitened_residual
 from calibslam_backend.box_measurement import BoxMeasurement, prepare
 from calibslam_backend.localisation import localise
+from calibslam_backend.robust import robust_loss
 from calibslam_msgs_py.measurements import Array
 
 POSES = around(10)
@@ -71,13 +73,11 @@ def test_the_result_is_never_worse_than_odometry_s_start() -> None:
     whitener = np.linalg.inv(np.linalg.cholesky(COVARIANCE))
 
     def cost(T: Array, predicted: Array, boxes: list[BoxMeasurement]) -> float:
-        from calibslam_backend.box_factor import INVISIBLE, whitened_residual
-
         e = whitener @ gtsam.Pose3.Logmap(gtsam.Pose3(predicted).between(gtsam.Pose3(T)))
-        total = 9.0 * np.log1p(e @ e / 9.0)
+        total = robust_loss(e @ e, 3.0)[0]
         for vector, box in zip(VECTORS, boxes, strict=True):
             visible, r, _ = whitened_residual(T, vector, CAMERA.K, *vars(box).values())
-            total += 4.0 * np.log1p((r @ r if visible else INVISIBLE**2) / 4.0)
+            total += robust_loss(r @ r if visible else INVISIBLE**2, 2.0)[0]
         return float(total)
 
     for trial in range(20):

@@ -1,0 +1,94 @@
+"""Whose a box of an earlier keyframe is, judged anew with what is known now.
+
+When a box was seen its quadric may not have been in the map, or the pose was still wrong: after a loop is closed, much
+is clear that was not. Given poses and quadrics, the boxes of a keyframe are assigned all at once, each to a quadric
+or to none. The cost of a pair is the squared Mahalanobis distance of the box to the one predicted, minus two log of
+how likely the quadric's boxes carry that class, minus a bonus if the box's track goes there elsewhere; to be given
+to no quadric costs as much as the gate. (The step of expectation to the step of maximisation that the graph is.)
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+
+import numba
+import numpy as np
+from scipy.stats import chi2
+
+from calibslam_backend.association import AssociationSettings, assign, class_cost
+from calibslam_backend.box_measurement import BoxMeasurement
+from calibslam_backend.quadric import box_of_visible_part, shapes
+from calibslam_backend.relocalisation import overlaps_at
+from calibslam_msgs_py.measurements import Array
+
+COHERENCE = 10.0  # bonus of a pair if all boxes of the track go to that quadric, half of it is lost if none
+
+
+def revise(
+    T_map_camera: Array,
+    boxes: Sequence[BoxMeasurement],
+    classes: Sequence[str],
+    by_track: Sequence[Counter[int]],
+    quadrics: Array,
+    ids: Sequence[int],
+    classes_of: Sequence[Counter[str]],
+    K: Array,
+    image: tuple[int, int],
+    settings: AssociationSettings,
+) -> list[int | None]:
+    """For each of N boxes of a keyframe the id of its quadric, or None.
+
+    Args:
+        T_map_camera: (4, 4) of the keyframe.
+        boxes: N.
+        classes: N, that they carry.
+        by_track: N; to which quadrics the boxes of the same track are given at present, how often.
+        quadrics: (M, 9) vectors.
+        ids: M.
+        classes_of: M, how many boxes of the quadric have which class.
+        K: (3, 3) camera matrix [px].
+        image: width and height [px].
+        settings: gate, model error, share of wrong classes.
+    """
+    if not boxes or not len(ids):
+        return [None] * len(boxes)
+    arrays = [np.stack([getattr(box, name) for box in boxes]) for name in ("corners", "whitener", "bounds", "clip")]
+    cost = squared_distances(
+        np.ascontiguousarray(T_map_camera), quadrics, K, np.array(image, float), *arrays, settings.model_error
+    )
+    gate = chi2.ppf(settings.gate, 4)
+    for n, (class_id, track) in enumerate(zip(classes, by_track, strict=True)):
+        for m in np.flatnonzero(np.isfinite(cost[:, n])).tolist():
+            cost[m, n] += class_cost(classes_of[m], class_id, settings.wrong_class)
+            if track:
+                cost[m, n] -= COHERENCE * (track[ids[m]] / track.total() - 0.5)
+    cost[cost >= gate] = np.inf
+    result: list[int | None] = [None] * len(boxes)
+    for row, column in assign(cost - gate):
+        result[column] = ids[row]
+    return result
+
+
+@numba.njit(cache=True)
+def squared_distances(T, quadrics, K, size, corners, whiteners, bounds, clip, model_error):  # type: ignore[no-untyped-def]
+    """(M, N) squared Mahalanobis distance of N boxes to those of M quadrics; infinite if they do not overlap.
+
+    The covariance is that of the measurement and that of the ellipsoid as a model of the object.
+    """
+    result = np.full((len(quadrics), len(corners)), np.inf)
+    compatible = np.ones((len(corners), len(quadrics)), np.bool_)
+    overlaps = overlaps_at(T, quadrics[:, :3].copy(), shapes(quadrics), K, size, corners, compatible)
+    for m in range(len(quadrics)):
+        for n in range(len(corners)):
+            if overlaps[n, m] == 0.0:
+                continue
+            visible, box, _ = box_of_visible_part(T, quadrics[m], K, bounds[n], clip[n])
+            if not visible:
+                continue
+            S = np.linalg.inv(whiteners[n].T @ whiteners[n])
+            for edge in range(4):
+                S[edge, edge] += (model_error * (box[edge % 2 + 2] - box[edge % 2])) ** 2
+            difference = box - corners[n]
+            result[m, n] = difference @ np.linalg.solve(S, difference)
+    return result

@@ -1,0 +1,148 @@
+"""Incremental smoothing by ISAM2, with factors that have names.
+
+ISAM2 knows a factor by the slot it was given. Here every factor has a name, under which it can be taken out again, and
+is kept: the tree can be built anew from all of them, or handed to Levenberg-Marquardt, at any time.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Hashable, Iterable
+
+import gtsam
+import numpy as np
+
+from calibslam_msgs_py.measurements import Array
+
+Name = Hashable
+
+
+class Smoother:
+    """Factors by name, values by key, and the Bayes tree that joins them.
+
+    Changes wait for the next `update`; `values` has new variables at once.
+    """
+
+    BATCH_ITERATIONS = 100
+    CONVERGED = 1e-5  # share by which an iteration of the batch optimiser has to lower the error
+
+    def __init__(self, thresholds: dict[str, tuple[int, float]]) -> None:
+        """`thresholds`: for each letter of keys the dimension of its variables and the change that relinearises."""
+        self._thresholds = thresholds
+        self.values = gtsam.Values()
+        self._factors: dict[Name, gtsam.NonlinearFactor] = {}
+        self._slots: dict[Name, int] = {}  # of the factors in the tree
+        self._isam = self._new_isam()
+        self._new: list[Name]
+        self._to_remove: list[int]
+        self._begin()
+
+    # -- changes ------------------------------------------------------------------------------------------------
+
+    def insert(self, key: int, value: gtsam.Pose3 | Array) -> None:
+        """A new variable."""
+        for values in (self._new_values, self.values):
+            values.insert(key, value)
+
+    def forget(self, key: int) -> None:
+        """A variable that no factor is left of; it goes with the next update."""
+        self.values.erase(key)
+        if self._new_values.exists(key):
+            self._new_values.erase(key)
+
+    def add(self, name: Name, factor: gtsam.NonlinearFactor) -> None:
+        """A new factor."""
+        if name in self._factors:
+            raise ValueError(f"there is a factor {name} already")
+        self._factors[name] = factor
+        self._new.append(name)
+
+    def remove(self, name: Name) -> None:
+        """Take a factor out."""
+        del self._factors[name]
+        if name in self._slots:
+            self._to_remove.append(self._slots.pop(name))
+        else:
+            self._new.remove(name)
+
+    def has(self, name: Name) -> bool:
+        """Whether a factor is in the tree, updates done."""
+        return name in self._slots
+
+    # -- solving ------------------------------------------------------------------------------------------------
+
+    def update(self, last: Iterable[int], held: Iterable[int]) -> None:
+        """One step of ISAM2.
+
+        Args:
+            last: keys to eliminate last.
+            held: keys that keep their linearisation point whatever they have moved.
+
+        Raises:
+            RuntimeError: GTSAM's, for example of an indeterminate system; the tree is then no longer usable.
+        """
+        changes = gtsam.ISAM2UpdateParams()
+        changes.removeFactorIndices = self._to_remove
+        changes.force_relinearize = True
+        groups = gtsam.KeyGroupMap()
+        for key in last:
+            groups.insert2(key, 1)
+        changes.constrainedKeys = groups
+        kept = gtsam.KeyList()
+        for key in held:
+            kept.push_back(key)
+        changes.noRelinKeys = kept
+        result = self._isam.update(self._graph(self._new), self._new_values, changes)
+        self._slots.update(zip(self._new, result.getNewFactorsIndices(), strict=True))
+        self._begin()
+        self.values = self._isam.calculateEstimate()
+
+    def optimise(self, values: gtsam.Values, iterations: int = BATCH_ITERATIONS) -> gtsam.Values:
+        """The optimum of all factors by Levenberg-Marquardt, from these values; the tree stays as it is."""
+        graph = self._graph(self._factors)
+        optimiser = gtsam.LevenbergMarquardtOptimizer(graph, values, gtsam.LevenbergMarquardtParams())
+        error = optimiser.error()
+        for _ in range(iterations):  # one at a time, so that other threads of the process are served in between
+            optimiser.iterate()
+            if error - optimiser.error() < self.CONVERGED * error:
+                break
+            error = optimiser.error()
+        return optimiser.values()
+
+    def rebuild(self, values: gtsam.Values, last: Iterable[int]) -> None:
+        """A new tree of all factors, linearised at these values."""
+        self._isam = self._new_isam()
+        self._begin()
+        self._slots.clear()
+        self._new = list(self._factors)
+        self._new_values = values
+        self.update(last, ())
+
+    def marginal(self, key: int) -> Array:
+        """Covariance of a variable."""
+        return np.asarray(self._isam.marginalCovariance(key))
+
+    def joint(self, keys: list[int]) -> gtsam.JointMarginal:
+        """Covariances between variables. One call for many costs little more than for one: each is a solve over the
+        tree between them."""
+        return self._isam.jointMarginalCovariance(keys)
+
+    def _begin(self) -> None:
+        """Nothing waits for an update."""
+        self._new = []
+        self._new_values = gtsam.Values()
+        self._to_remove = []
+
+    def _graph(self, names: Iterable[Name]) -> gtsam.NonlinearFactorGraph:
+        graph = gtsam.NonlinearFactorGraph()
+        for name in names:
+            graph.push_back(self._factors[name])
+        return graph
+
+    def _new_isam(self) -> gtsam.ISAM2:
+        parameters = gtsam.ISAM2Params()
+        parameters.relinearizeSkip = 1  # `update` is told what may be relinearised
+        thresholds = gtsam.ISAM2ThresholdMap()
+        for letter, (size, threshold) in self._thresholds.items():
+            thresholds.insert((letter, np.full(size, threshold)))
+        parameters.setRelinearizeThreshold(thresholds)
+        return gtsam.ISAM2(parameters)
