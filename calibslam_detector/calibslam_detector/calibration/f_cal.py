@@ -30,17 +30,17 @@ class FCal(nn.Module):
     correlation widens the sums and is seen.
 
     Sums that share residuals are not independent, and the fit to them must know it: rows are drawn with
-    replacement, and the fit's mean is cleared of the variance it has from batch to batch. Then the expected
-    Wasserstein loss of true covariances is the least one in every direction, and that of KL is zero there too (both
-    to order 1/N; docs/calibration.md). `published=True` is the published code instead: rows without replacement, the
-    fit as it is, which shrinks the variance to 2K (1 - K/N).
+    replacement, and the fit's mean is cleared of the variance it has from batch to batch. So true covariances are
+    where the expected loss is least, to order 1/N (docs/calibration.md); that of one batch may be negative. Batches
+    must be new, or drawn from many more than K residuals. `published=True` is the published code instead: rows
+    without replacement, whose sums have the variance 2K (1 - K/N), and the fit as it is.
 
     Args:
         K: degrees of freedom of a sum, a multiple of d; the normal limit needs some 50.
         H: sums that are drawn.
         divergence: "kl" or "wasserstein".
         published: without the correction.
-        generator: of the draws; None: torch's own.
+        generator: of the draws, on the device of the residuals; None: torch's own.
     """
 
     def __init__(

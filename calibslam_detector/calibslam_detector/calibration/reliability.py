@@ -61,7 +61,7 @@ def plot(curves: Mapping[str, Reliability], path: Path, title: str) -> None:
     axes.set(xlim=(0, 1), ylim=(0, 1), aspect="equal", title=title)
     axes.set(xlabel="predicted probability", ylabel="share observed")
     axes.grid(alpha=0.3)
-    axes.legend(loc="upper left", fontsize=8)
+    axes.legend(fontsize=8)
     figure.tight_layout()
     figure.savefig(path)
     plt.close(figure)
