@@ -77,7 +77,7 @@ def test_images_of_a_bag_become_boxes(live: tuple[int, Watcher, Process], bag: P
     image = images[boxes.stamp]  # one of them: a busy machine drops others
     assert (boxes.width, boxes.height, boxes.frame_id) == (640, 480, image.header.frame_id)
     # What comes out is what the detector says, with covariances that can be used.
-    expected = Detector.from_file(weights, DetectorSettings(THRESHOLD, "cpu"))(decode_compressed(image.data))
+    expected, _ = Detector.from_file(weights, DetectorSettings(THRESHOLD, "cpu"))(decode_compressed(image.data))
     expected, _ = valid_boxes(expected)
     assert len(expected) > 0
     np.testing.assert_allclose(boxes.corners, expected.corners, atol=0.01)

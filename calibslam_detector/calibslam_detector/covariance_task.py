@@ -37,7 +37,7 @@ LOSSES: dict[str, tuple[Callable[[], torch.nn.Module] | None, float]] = {
 
 @dataclass(frozen=True)
 class Examples:
-    """Detections that are of a labelled object, M of them.
+    """Detections that are of a labelled object, M of them in N images.
 
     Attributes:
         features: (M, F) of their regions.
@@ -45,6 +45,7 @@ class Examples:
         labels: (M,).
         residuals: (M, 4) true minus found, in deltas against the region's proposal.
         whole: (M,) whether the object lies inside the image with all its edges.
+        descriptors: (N, C) of the images, see `familiarity`.
     """
 
     features: Tensor
@@ -52,6 +53,7 @@ class Examples:
     labels: Tensor
     residuals: Tensor
     whole: Tensor
+    descriptors: Tensor
 
     def __len__(self) -> int:
         return len(self.labels)
@@ -95,6 +97,7 @@ def _examples(model: CalibratedDetector, regions: Regions, detected: np.ndarray,
         regions.labels[indices].cpu(),
         residuals.cpu(),
         whole,
+        regions.descriptor[None].cpu(),
     )
 
 

@@ -28,7 +28,7 @@ def plot_curves(log: Path, out: Path) -> None:
         axis.plot(steps, values, color="0.75", linewidth=0.8)
         if len(values) >= WINDOW:
             smooth = np.convolve(values, np.full(WINDOW, 1.0 / WINDOW), mode="valid")
-            axis.plot(steps[WINDOW - 1 :], smooth, color="tab:blue")
+            axis.plot(steps[WINDOW // 2 :][: len(smooth)], smooth, color="tab:blue")
         axis.set_ylabel(name)
         axis.grid(alpha=0.3)
     axes[-1, 0].set_xlabel("step")

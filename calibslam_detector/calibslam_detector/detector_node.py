@@ -9,6 +9,7 @@ from __future__ import annotations
 import sys
 import threading
 import time
+from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -30,6 +31,8 @@ from calibslam_msgs_py.settings import Settings, SettingsError, declare_paramete
 
 SECONDS_BETWEEN_WARNINGS = 5.0
 OVERLAY_QUALITY = 85  # of JPEG
+# Of images like those learnt from, 5 % are strange; of 20 independent ones more than half once in 10^9 times.
+STRANGE_WINDOW, STRANGE_SHARE = 20, 0.5
 
 
 @dataclass(frozen=True)
@@ -70,6 +73,7 @@ class DetectorNode(Node):
         self._newest: Waiting | None = None
         self._arrived = threading.Condition()
         self._stop = False
+        self._strange: deque[bool] = deque(maxlen=STRANGE_WINDOW)
         self._worker = threading.Thread(target=self._work, name="detector", daemon=True)
         self._worker.start()
         self.create_subscription(Image, "camera/image_raw", self._receive_raw, SENSOR)
@@ -117,18 +121,32 @@ class DetectorNode(Node):
     def _detect(self, waiting: Waiting) -> None:
         start = time.monotonic()
         image = waiting.decode()
-        boxes, rejected = valid_boxes(self._detector(image, waiting.stamp, waiting.frame_id))
+        found, strangeness = self._detector(image, waiting.stamp, waiting.frame_id)
+        boxes, rejected = valid_boxes(found)
         for reason, count in rejected.items():
             self._counters.count(f"rejected_box_{reason}", count)
         self._boxes.publish(boxes_to_msg(boxes, self._types))
         self._counters.count("images")
         self._counters.count("boxes", len(boxes))
+        self._watch(strangeness)
         self._counters.set("detection_ms", f"{(time.monotonic() - start) * 1e3:.0f}")
         if self._overlay.get_subscription_count():
             drawn = draw_overlay(image[..., ::-1], boxes)
             data = self._types.octets(encode_jpeg(drawn, OVERLAY_QUALITY))
             header = header_to_msg(waiting.stamp, waiting.frame_id, self._types)
             self._overlay.publish(CompressedImage(header=header, format="jpeg", data=data))
+
+    def _watch(self, strangeness: float) -> None:
+        """Say where images are no longer like those that covariances were learnt from."""
+        self._strange.append(strangeness > 1.0)
+        share = sum(self._strange) / len(self._strange)
+        self._counters.set("strange_images", f"{share:.0%} of the last {len(self._strange)}")
+        if len(self._strange) == STRANGE_WINDOW and share > STRANGE_SHARE:
+            self._counters.count("images_outside_what_is_known")
+            self.get_logger().warning(
+                f"{share:.0%} of the last images are unlike those learnt from: covariances may be too small",
+                throttle_duration_sec=SECONDS_BETWEEN_WARNINGS,
+            )
 
     def close(self) -> None:
         """Let the worker end its image."""

@@ -50,10 +50,19 @@ class Errors:
     covariances: Array
 
 
-def detect_all(detector: Detector, data: CocoData) -> list[Boxes | None]:
-    """Boxes of each image; None where a file is no image."""
-    images = (read_image(truth.file) for truth in tqdm(data.images, desc="detecting", unit="image"))
-    return [None if image is None else detector(image) for image in images]
+def detect_all(detector: Detector, data: CocoData) -> tuple[list[Boxes | None], float]:
+    """Boxes of each image, None where a file is no image; and the share of images with a strangeness above 1."""
+    found: list[Boxes | None] = []
+    strangeness = []
+    for truth in tqdm(data.images, desc="detecting", unit="image"):
+        image = read_image(truth.file)
+        if image is None:
+            found.append(None)
+            continue
+        boxes, strange = detector(image)
+        found.append(boxes)
+        strangeness.append(strange)
+    return found, float(np.mean(np.array(strangeness) > 1.0)) if strangeness else 0.0
 
 
 def errors_of_whole_objects(found: list[Boxes | None], data: CocoData, score_threshold: float) -> Errors:
@@ -160,9 +169,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     except (DataError, WeightsError, DeviceError) as error:
         print(f"evaluate_detector: {error}", file=sys.stderr)
         return 1
-    found = detect_all(detector, data)
+    found, strange_share = detect_all(detector, data)
     sample = errors_of_whole_objects(found, data, settings.score_threshold)
-    result = {"images": len(data.images), **precision(found, data), **calibration_metrics(sample)}
+    counts = {"images": len(data.images), "strange_share": strange_share}
+    result = {**counts, **precision(found, data), **calibration_metrics(sample)}
     arguments.out.mkdir(parents=True, exist_ok=True)
     (arguments.out / "metrics.json").write_text(json.dumps(result, indent=2) + "\n", encoding="utf-8")
     if "ece_z" in result:

@@ -25,6 +25,7 @@ from torchvision.ops.misc import FrozenBatchNorm2d
 
 from calibslam_detector.box_covariance import corner_covariances, rescaled
 from calibslam_detector.covariance_head import CovarianceHead, geometry
+from calibslam_detector.familiarity import Familiarity, descriptor
 
 # The compact network: a quarter of torchvision's MobileNet detector, and finer levels for small things.
 COMPACT_CHANNELS, COMPACT_FEATURES = 128, 256  # of a level, of a region
@@ -89,6 +90,7 @@ class Regions:
         scores, labels: (N,).
         proposals: (N, 4) that the boxes were described against [px of the network's input].
         features: (N, F) of the regions.
+        descriptor: (C,) of the whole image, see `familiarity`.
         size: height and width of the network's input [px].
     """
 
@@ -97,6 +99,7 @@ class Regions:
     labels: Tensor
     proposals: Tensor
     features: Tensor
+    descriptor: Tensor
     size: tuple[int, int]
 
     @property
@@ -106,7 +109,7 @@ class Regions:
 
 
 class CalibratedDetector(nn.Module):
-    """A detector whose boxes have covariances.
+    """A detector whose boxes have covariances, and which knows the images that it has learnt them from.
 
     `forward` is that of the plain detector, for training it.
 
@@ -123,6 +126,7 @@ class CalibratedDetector(nn.Module):
         self.detector = ARCHITECTURES[architecture](classes)
         if frozen_norm:
             freeze_norms(self.detector)
+        self.familiarity = Familiarity(self.detector.backbone.out_channels)
         self.covariance_head = CovarianceHead(self.detector.roi_heads.box_predictor.cls_score.in_features, classes)
 
     def forward(self, images: list[Tensor], targets: list[dict[str, Tensor]] | None = None) -> dict[str, Tensor]:
@@ -150,13 +154,19 @@ class CalibratedDetector(nn.Module):
         return [
             self._choose(*of_image)
             for of_image in zip(
-                boxes.split(counts), scores.split(counts), proposals, vectors.split(counts), inputs.image_sizes,
-                strict=True,
+                boxes.split(counts), scores.split(counts), proposals, vectors.split(counts),
+                descriptor(features["0"]), inputs.image_sizes, strict=True,
             )
         ]  # fmt: skip
 
     def _choose(
-        self, boxes: Tensor, scores: Tensor, proposals: Tensor, features: Tensor, size: tuple[int, int]
+        self,
+        boxes: Tensor,
+        scores: Tensor,
+        proposals: Tensor,
+        features: Tensor,
+        image_descriptor: Tensor,
+        size: tuple[int, int],
     ) -> Regions:
         """Of all boxes (P, C, 4) and scores (P, C) of an image those that count, as torchvision chooses them."""
         heads = self.detector.roi_heads
@@ -174,6 +184,7 @@ class CalibratedDetector(nn.Module):
             labels=kept % classes + 1,
             proposals=proposals[of_proposal],
             features=features[of_proposal],
+            descriptor=image_descriptor,
             size=(int(size[0]), int(size[1])),
         )
 
@@ -184,7 +195,9 @@ class CalibratedDetector(nn.Module):
         return corner_covariances(variances, couplings, regions.proposals, regions.boxes, weights)
 
     def detect(self, images: list[Tensor]) -> list[dict[str, Tensor]]:
-        """Boxes (N, 4), labels and scores (N,) as torchvision returns them, and covariances (N, 4, 4) [px^2]."""
+        """Boxes (N, 4), labels and scores (N,) as torchvision returns them, covariances (N, 4, 4) [px^2], and the
+        image's strangeness (), see `familiarity`.
+        """
         found = self.regions(images)
         originals = [(int(image.shape[-2]), int(image.shape[-1])) for image in images]
         plain = [{"boxes": r.boxes, "labels": r.labels, "scores": r.scores} for r in found]
@@ -192,6 +205,7 @@ class CalibratedDetector(nn.Module):
             plain, [r.size for r in found], originals
         )
         for result, regions, original in zip(results, found, originals, strict=True):
+            result["strangeness"] = self.familiarity(regions.descriptor[None])[0]
             result["covariances"] = rescaled(self.covariances(regions), regions.size, original)
         return results
 

@@ -109,6 +109,7 @@ def _train_covariance(arguments: argparse.Namespace, settings: TrainSettings, lo
     if len(examples) < MIN_EXAMPLES:
         raise TrainingError(f"only {len(examples)} boxes were found again by the detector; {MIN_EXAMPLES} are needed")
     print(f"{len(examples)} boxes found again, {int(examples.whole.sum())} of them of objects wholly in the image")
+    model.familiarity.fit(examples.descriptors.to(device))
     torch.manual_seed(loop.seed)
     task = covariance_task(model, examples, settings.loss, settings.regions, loop, device)
     optimise(task, loop, arguments.out, _identity(settings, loop, data), arguments.resume)

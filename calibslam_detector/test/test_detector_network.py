@@ -18,6 +18,7 @@ from calibslam_detector.box_covariance import (
     rescaled,
 )
 from calibslam_detector.covariance_head import GEOMETRY, MAX_COUPLING, VARIANCE_BOUNDS, CovarianceHead, geometry
+from calibslam_detector.familiarity import Familiarity, descriptor
 from calibslam_detector.network import ARCHITECTURES, CalibratedDetector, freeze_norms
 
 CODER = BoxCoder((10.0, 10.0, 5.0, 5.0))
@@ -152,6 +153,19 @@ def test_geometry_tells_size_and_borders() -> None:
     numbers = geometry(box, torch.tensor([0.5]), (100, 100))[0].tolist()
     expected = [np.log(0.4), np.log(0.3), 1.0, np.exp(-30 / 1.5), np.exp(-60 / 2.0), np.exp(-40 / 1.5), 0.0]
     assert numbers == pytest.approx(expected, abs=1e-6)
+
+
+def test_images_unlike_those_known_are_strange() -> None:
+    generator = torch.Generator().manual_seed(5)
+    mixing = torch.randn(16, 16, generator=generator)
+    known, like, unlike = (torch.randn(n, 16, generator=generator) @ mixing for n in (4000, 4000, 1000))
+    familiarity = Familiarity(16)
+    assert (familiarity(known) == 0.0).all()
+    familiarity.fit(known)
+    # 95 % of 4000, with the spread of the quantile of 1000 held-out ones (0.7 points).
+    assert float((familiarity(like) > 1.0).float().mean()) == pytest.approx(0.05, abs=0.022)
+    assert float((familiarity(unlike + 3.0 * mixing.sum(dim=0)) > 1.0).float().mean()) > 0.9
+    torch.testing.assert_close(descriptor(torch.arange(8.0).view(1, 2, 2, 2)), torch.tensor([[1.5, 5.5]]))
 
 
 def test_no_box_is_no_trouble(network: CalibratedDetector, images: list[torch.Tensor]) -> None:

@@ -219,7 +219,9 @@ def examples(count: int) -> tuple[Examples, torch.Tensor]:
     sigma = torch.exp(0.5 * features[:, :4] - 1.0)
     residuals = sigma * torch.randn(count, 4, generator=generator)
     labels = torch.randint(1, 3, (count,), generator=generator)
-    return Examples(features, torch.zeros(count, 7), labels, residuals, torch.ones(count, dtype=torch.bool)), sigma
+    return Examples(
+        features, torch.zeros(count, 7), labels, residuals, torch.ones(count, dtype=torch.bool), torch.zeros(1, 128)
+    ), sigma
 
 
 @pytest.mark.parametrize("loss", list(LOSSES))
