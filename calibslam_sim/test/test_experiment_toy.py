@@ -109,7 +109,7 @@ def test_errors_of_the_truth_are_the_noise() -> None:
     odometry, measurements = np.sum(found.odometry_noise**2) / 2, np.sum(found.measurement_noise**2) / 2
     expected = {
         "calibrated": odometry + measurements,
-        "direct_calibrated": odometry + measurements,
+        "direct_overconfident": odometry + 4 * measurements,
         "underconfident": odometry + measurements / 4,
         "odometry_scale_0.5": 4 * odometry + measurements,
         "varying_calibrated": odometry + measurements,

@@ -4,7 +4,7 @@ Four families of conditions, each in the same worlds:
     calibrated, underconfident, ..., scale_S: the graph believes landmark measurements S times as noisy as they are;
     odometry_scale_S: the same with odometry;
     varying_...: every measurement has a noise of its own; the graph knows it (calibrated) or believes a constant;
-    direct_...: some of the first, optimised straight from odometry, where one run in twenty ends in a wrong minimum.
+    direct_overconfident: optimised straight from odometry, where one run in twenty ends in a wrong minimum.
 All others are widened first: they believe measurements 8, 4 and 2 times as noisy on the way to their optimum.
 """
 
@@ -50,7 +50,6 @@ from matplotlib import pyplot as plt
 ODOMETRY, VARYING = "odometry_", "varying_"
 VARYING_CALIBRATED, VARYING_RMS = VARYING + CALIBRATED, VARYING + "rms"
 DIRECT = "direct_"
-NAMED = (OVERCONFIDENT, CALIBRATED, UNDERCONFIDENT)
 WIDENING = (8.0, 4.0, 2.0)
 COARSE = 1e-5  # tolerance of the optimisation on the way
 FIXED_SIGMA = 1e-6  # of the start, where errors relative to it are meant [m, rad]
@@ -149,19 +148,18 @@ def conditions(settings: ToySettings) -> list[str]:
         VARYING_CALIBRATED,
         VARYING_RMS,
         *(scale_name(scale, VARYING) for scale in SCALES),
-        *(DIRECT + name for name in NAMED),
+        DIRECT + OVERCONFIDENT,
     ]
 
 
 def comparisons(settings: ToySettings) -> list[tuple[str, str]]:
     """The truth against all others of its family."""
-    families: dict[str, list[str]] = {CALIBRATED: [], VARYING_CALIBRATED: [], DIRECT + CALIBRATED: []}
-    for name in conditions(settings):
-        if name.startswith(VARYING):
-            families[VARYING_CALIBRATED].append(name)
-        else:
-            families[DIRECT + CALIBRATED if name.startswith(DIRECT) else CALIBRATED].append(name)
-    return [(truth, name) for truth, names in families.items() for name in names if name != truth]
+    return [
+        (truth, name)
+        for name in conditions(settings)
+        for truth in (VARYING_CALIBRATED if name.startswith(VARYING) else CALIBRATED,)
+        if name != truth
+    ]
 
 
 def figure(result: dict[str, Any], path: Path) -> None:
@@ -227,7 +225,7 @@ EXPERIMENT = Experiment(
     title="Robot and landmarks in the plane under wrong covariances (Table 5.1)",
     settings=ToySettings,
     quick={"poses": 60, "turn_rate": 0.2},
-    seeds=200,
+    seeds=400,  # 0.06 m of ATE between x1 and x1/2, with a deviation of 0.26 m over pairs
     quick_seeds=5,
     metrics=METRICS,
     conditions=conditions,
