@@ -89,6 +89,6 @@ class Task:
 
 
 TASKS = {
-    "curve": Task(curve, training=1000, held_out=1000, test=40000, epochs=40, batch=100),
-    "bokeh": Task(bokeh, training=1500, held_out=500, test=10000, epochs=30, batch=100),
+    "curve": Task(curve, training=1000, held_out=2000, test=40000, epochs=40, batch=100),
+    "bokeh": Task(bokeh, training=1500, held_out=1000, test=10000, epochs=30, batch=100),
 }
