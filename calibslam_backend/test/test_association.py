@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from collections import Counter
 
 import gtsam
 import numpy as np
@@ -16,6 +17,7 @@ from calibslam_backend.association import (
     Prediction,
     Votes,
     assign,
+    class_cost,
     distances,
     predict,
     same_object,
@@ -96,6 +98,17 @@ def test_a_wrong_class_costs_its_odds_and_little_overlap_is_no_match() -> None:
     assert cost[1] - cost[0] == pytest.approx(-np.log(0.05))
     assert np.isinf(cost[2])
     assert distances([], boxes, ["cup"] * 3, settings).shape == (0, 3)
+
+
+def test_cost_of_a_class_by_hand() -> None:
+    """Of 10 boxes 8 are cups and 2 are bottles: -2 log(0.95 share + 0.05)."""
+    classes = Counter(cup=8, bottle=2)
+    assert class_cost(classes, "cup", 0.05) == pytest.approx(-2.0 * np.log(0.81))
+    assert class_cost(classes, "bottle", 0.05) == pytest.approx(-2.0 * np.log(0.24))
+    assert class_cost(classes, "book", 0.05) == pytest.approx(-2.0 * np.log(0.05))
+    # Of nothing known, every class is as likely; boxes that were taken away again count as none.
+    assert class_cost(Counter(), "cup", 0.05) == class_cost(Counter(), "book", 0.05)
+    assert class_cost(Counter(cup=3, book=0), "book", 0.05) == pytest.approx(-2.0 * np.log(0.05))
 
 
 def test_the_surer_landmark_is_not_always_the_nearer_one() -> None:

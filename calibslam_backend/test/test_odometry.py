@@ -225,3 +225,28 @@ def test_one_unknown_step_makes_the_whole_motion_unknown() -> None:
     np.testing.assert_allclose(chain.between(T0, T0 + STEP)[1], COVARIANCE, atol=1e-12)
     # A step that only touches the interval is not part of it.
     np.testing.assert_allclose(chain.between(T0 + 2 * STEP, T0 + 3 * STEP)[1], COVARIANCE, atol=1e-12)
+
+
+# -- drifts ---------------------------------------------------------------------------------------------------------
+
+
+def test_only_motions_of_unknown_covariance_drift() -> None:
+    """Three steps of 0.1 s, the second one unknown: whatever touches its inside drifts, all the time."""
+    moves = steps(3)
+    chain = chain_of([motion(0, moves[0]), motion(1, moves[1], None), motion(2, moves[2])])
+    end = T0 + 3 * STEP
+    assert chain.drifts(T0, T0 + STEP) == 0.0
+    assert chain.drifts(T0 + 2 * STEP, end) == 0.0
+    assert chain.drifts(T0 + 2 * STEP + 1, end) == 0.0
+    assert chain.drifts(T0, end) == pytest.approx(0.3)
+    assert chain.drifts(T0 + STEP, T0 + 2 * STEP) == pytest.approx(0.1)
+    assert chain.drifts(T0 + STEP // 2, T0 + STEP + STEP // 2) == pytest.approx(0.1)
+    assert chain.drifts(T0 + 2 * STEP - 1, end) == pytest.approx(0.1 + 1e-9)
+    assert chain.drifts(T0, T0) == 0.0
+
+
+def test_a_bridged_gap_does_not_drift() -> None:
+    """What is not measured has no constant error; its covariance says what is not known."""
+    chain = chain_of([motion(0, gtsam.Pose3())])
+    chain.add(RelativeMotion(T0 + 3 * STEP, T0 + 4 * STEP, np.eye(4), COVARIANCE))
+    assert chain.drifts(T0, T0 + 4 * STEP) == 0.0

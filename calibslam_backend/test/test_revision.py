@@ -1,0 +1,139 @@
+"""Whose a box of an earlier keyframe is: frames made by hand."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from calibslam_backend.association import AssociationSettings, class_cost
+from calibslam_backend.box_measurement import BoxMeasurement
+from calibslam_backend.quadric import ALL_EDGES, Ellipsoid, box_of_visible_part, image_bounds
+from calibslam_backend.revision import COHERENCE, revise, squared_distances
+from calibslam_msgs_py.measurements import Array
+
+K = np.array([[500.0, 0.0, 320.0], [0.0, 500.0, 240.0], [0.0, 0.0, 1.0]])
+BOUNDS = image_bounds(640, 480)
+SIGMA = 3.0  # [px] of an edge
+LEFT, RIGHT = 4, 9  # ids
+SETTINGS = AssociationSettings(gate=0.99, model_error=0.0, wrong_class=0.05)
+GATE = 13.2767  # chi-squared, 4 degrees of freedom, 0.99
+CUPS = Counter(cup=20)
+
+
+def at(x: float, radius: float = 0.1) -> Array:
+    """(9,) a ball at 2 m, x metres to the right of the optical axis."""
+    T = np.eye(4)
+    T[:3, 3] = [x, 0.0, 2.0]
+    return Ellipsoid(T, np.full(3, radius)).vector()
+
+
+def seen(quadric: Array) -> Array:
+    return np.asarray(box_of_visible_part(np.eye(4), quadric, K, BOUNDS, ~ALL_EDGES)[1])
+
+
+# Two neighbours whose boxes, 50 px wide, overlap: 25 px apart.
+QUADRICS = np.stack([at(-0.05), at(0.05)])
+
+
+def arrays(boxes: Sequence[Array], sigma: float = SIGMA) -> list[BoxMeasurement]:
+    """Boxes as `revise` takes them."""
+    return [BoxMeasurement(corners, np.eye(4) / sigma, BOUNDS, ~ALL_EDGES) for corners in boxes]
+
+
+def whose(
+    boxes: Sequence[Array],
+    classes: Sequence[str] | None = None,
+    tracks: Sequence[Counter[int]] | None = None,
+    classes_of: Sequence[Counter[str]] = (CUPS, CUPS),
+    settings: AssociationSettings = SETTINGS,
+) -> list[int | None]:
+    """The quadric of each box, the camera being at the origin."""
+    return revise(
+        np.eye(4),
+        arrays(boxes),
+        classes or ["cup"] * len(boxes),
+        tracks or [Counter()] * len(boxes),
+        QUADRICS,
+        [LEFT, RIGHT],
+        classes_of,
+        K,
+        (640, 480),
+        settings,
+    )
+
+
+def test_boxes_go_to_the_quadrics_they_fit() -> None:
+    boxes = [seen(quadric) for quadric in QUADRICS]
+    assert whose(boxes) == [LEFT, RIGHT]
+    assert whose(boxes[::-1]) == [RIGHT, LEFT]
+
+
+def test_a_box_given_to_the_neighbour_is_moved() -> None:
+    """Also where its track went there, as long as it fits clearly: 25 px off are more than the bonus of coherence."""
+    wrong = Counter({LEFT: 5})
+    assert whose([seen(QUADRICS[1])], tracks=[wrong]) == [RIGHT]
+
+
+def test_boxes_are_assigned_together() -> None:
+    """Two boxes that both fit the left one best: one has to be the right one's, the one for which it is cheaper."""
+    nearer, farther = seen(QUADRICS[0]) + 8.0 * np.array([1, 0, 1, 0]), seen(QUADRICS[0]) + 9.0 * np.array([1, 0, 1, 0])
+    loose = replace(SETTINGS, gate=0.9999, model_error=0.2)
+    assert whose([nearer], settings=loose) == whose([farther], settings=loose) == [LEFT]
+    assert whose([nearer, farther], settings=loose) == [LEFT, RIGHT]
+
+
+def test_a_box_of_nothing_stays_open() -> None:
+    """Beyond the gate of every quadric: without overlap, or too far for its covariance."""
+    boxes = [seen(at(0.6)), seen(QUADRICS[1]) + 12.0 * np.array([1, 0, 1, 0])]  # q = 2 (12 / 3)^2 = 32
+    assert whose(boxes) == [None, None]
+    assert whose([]) == []
+
+
+@pytest.mark.parametrize(("share", "expected"), [(0.99, LEFT), (1.01, None)])
+def test_the_gate_by_hand(share: float, expected: int | None) -> None:
+    """Two edges moved by d: q = 2 (d / sigma)^2. Away from the neighbour."""
+    d = share * SIGMA * np.sqrt(0.5 * (GATE - class_cost(CUPS, "cup", SETTINGS.wrong_class)))
+    assert whose([seen(QUADRICS[0]) - d * np.array([1, 0, 1, 0])]) == [expected]
+
+
+def test_classes_are_evidence() -> None:
+    """Half way between both, the class decides; against a clear fit it does not."""
+    middle = seen(at(0.0))
+    classes_of = (Counter(cup=20), Counter(bottle=20))
+    loose = replace(SETTINGS, model_error=0.2)
+    for class_id, expected in (("cup", LEFT), ("bottle", RIGHT)):
+        assert whose([middle], [class_id], classes_of=classes_of, settings=loose) == [expected]
+    assert whose([seen(QUADRICS[0])], ["bottle"], classes_of=classes_of) == [LEFT]
+
+
+def test_the_track_decides_a_tie() -> None:
+    loose = replace(SETTINGS, model_error=0.2)
+    for mostly, expected in ((LEFT, LEFT), (RIGHT, RIGHT)):
+        tracks = [Counter({mostly: 5, LEFT + RIGHT - mostly: 1})]
+        assert whose([seen(at(0.0))], tracks=tracks, settings=loose) == [expected]
+
+
+@pytest.mark.parametrize(("share", "expected"), [(0.98, LEFT), (1.02, None)])
+def test_the_bonus_of_coherence_by_hand(share: float, expected: int | None) -> None:
+    """A box whose whole track goes to a quadric is taken beyond the gate, by half of the bonus."""
+    q = GATE + 0.5 * COHERENCE - class_cost(CUPS, "cup", SETTINGS.wrong_class)
+    d = share * SIGMA * np.sqrt(0.5 * q)
+    assert whose([seen(QUADRICS[0]) - d * np.array([1, 0, 1, 0])], tracks=[Counter({LEFT: 5})]) == [expected]
+
+
+def test_distances_by_hand() -> None:
+    """q = sum of (edge / sigma)^2, sigma^2 = 3^2 + (0.1 * 50)^2 with a model error of a tenth of the box."""
+    box = seen(QUADRICS[0]) + np.array([1.0, 2.0, -3.0, 4.0])
+    measured = arrays([box])
+    stacked = [np.stack([getattr(b, name) for b in measured]) for name in ("corners", "whitener", "bounds", "clip")]
+    found = squared_distances(np.eye(4), QUADRICS, K, np.array([640.0, 480.0]), *stacked, 0.1)
+    size = seen(QUADRICS[0])[2:] - seen(QUADRICS[0])[:2]
+    variance = SIGMA**2 + (0.1 * np.tile(size, 2)) ** 2
+    assert found.shape == (2, 1)
+    assert found[0, 0] == pytest.approx((np.array([1.0, 4.0, 9.0, 16.0]) / variance).sum(), rel=1e-9)
+    behind = np.diag([1.0, -1.0, -1.0, 1.0])
+    assert np.isinf(squared_distances(behind, QUADRICS, K, np.array([640.0, 480.0]), *stacked, 0.1)).all()
