@@ -35,6 +35,10 @@ class Samples:
         first = Samples(self.x[:n], self.y[:n], self.sigma[:n])
         return first, Samples(self.x[n:], self.y[n:], self.sigma[n:])
 
+    def __add__(self, other: Samples) -> Samples:
+        """These, then the others."""
+        return Samples(torch.cat([self.x, other.x]), torch.cat([self.y, other.y]), torch.cat([self.sigma, other.sigma]))
+
 
 def curve(n: int, generator: torch.Generator) -> Samples:
     """1-D: three waves on [-1, 1], with noise between 0.05 and 0.5 that depends on where."""
