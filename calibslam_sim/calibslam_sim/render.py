@@ -15,7 +15,7 @@ from calibslam_backend.quadric import image_bounds, project
 from calibslam_msgs_py.measurements import SECOND, Array, Camera
 from calibslam_sim.camera_path import camera_path
 from calibslam_sim.random_streams import stream
-from calibslam_sim.render_kernels import cast, shade, visible_parts
+from calibslam_sim.render_kernels import cast, cast_shadows, shade, visible_parts
 from calibslam_sim.render_looks import looks
 from calibslam_sim.world import TABLE_HALF_SIZE, TABLE_HEIGHT, WorldObject
 
@@ -23,6 +23,7 @@ ROOM = np.array([-3.4, -3.1, 0.0, 3.4, 3.1, 2.8])  # [m] lower and upper corner
 TABLE_EDGE = 0.05  # [m] beyond where things may stand
 TABLE_THICKNESS = 0.03  # [m]
 FOOT_HALF_SIZE = np.array([0.35, 0.2])  # [m] of what carries the table
+SHADOW_SIZE = 600  # texels of shadows across the room: about 1 cm each
 # An edge of the visible part nearer than this to that of the whole object is one and the same [px]: cast rays
 # find it to half a pixel, geometry exactly.
 SAME_EDGE = 1.5
@@ -75,6 +76,9 @@ class Renderer:
         rotations = self._T_world_object[:, :3, :3]
         self._whitening = np.ascontiguousarray(rotations.transpose(0, 2, 1) / self._radii[:, :, None])
         self._boxes = _table()
+        self._shadows = np.empty((2, SHADOW_SIZE, SHADOW_SIZE), np.float32)
+        for height, shadow in zip((0.0, TABLE_HEIGHT), self._shadows, strict=True):
+            cast_shadows(height, ROOM, self._looks.light[:3], self._centres, self._whitening, shadow)
 
     def render(self, time: int) -> RenderedImage:
         """The image taken at `time` [ns], the middle of the exposure."""
@@ -95,7 +99,7 @@ class Renderer:
         look = self._looks
         shade(
             K, T_world_camera, ids, depths, self._centres, self._whitening, look.patterns, look.numbers,
-            look.colours, look.surfaces, look.lattice, look.light, light,
+            look.colours, look.surfaces, look.lattice, look.light, ROOM, self._shadows, light,
         )  # fmt: skip
         T_end_start = np.linalg.inv(T_world_end) @ T_world_start
         light = optics.blur(light, depths, K, T_end_start, optics.focus_at(time))

@@ -160,30 +160,51 @@ def _shares(pattern, q, frequency, phase, lattice):  # type: ignore[no-untyped-d
 
 
 @numba.njit(cache=True)
-def _shadow(p, centres, whitening, lamps):  # type: ignore[no-untyped-def]
-    """Share of the lamp's light that reaches p past the ellipsoids, with a soft border.
+def cast_shadows(height, room, lamp, centres, whitening, share):  # type: ignore[no-untyped-def]
+    """Share (S, S) of the lamp's light that reaches the plane at this height past the ellipsoids, with soft borders.
 
-    `lamps` (N, 3) are the lamp's unit-sphere coordinates in each ellipsoid.
+    Written to `share`, whose rows and columns span the room (6,) in y and x.
     """
-    share = 1.0
+    size = share.shape[0]
+    lamps = np.empty_like(centres)
     for n in range(len(centres)):
-        e0, e1, e2 = p[0] - centres[n, 0], p[1] - centres[n, 1], p[2] - centres[n, 2]
-        o0 = whitening[n, 0, 0] * e0 + whitening[n, 0, 1] * e1 + whitening[n, 0, 2] * e2
-        o1 = whitening[n, 1, 0] * e0 + whitening[n, 1, 1] * e1 + whitening[n, 1, 2] * e2
-        o2 = whitening[n, 2, 0] * e0 + whitening[n, 2, 1] * e1 + whitening[n, 2, 2] * e2
-        d0, d1, d2 = lamps[n, 0] - o0, lamps[n, 1] - o1, lamps[n, 2] - o2
-        along = -(o0 * d0 + o1 * d1 + o2 * d2) / (d0 * d0 + d1 * d1 + d2 * d2)
-        along = min(max(along, 0.0), 1.0)
-        o0, o1, o2 = o0 + along * d0, o1 + along * d1, o2 + along * d2
-        squared = o0 * o0 + o1 * o1 + o2 * o2
-        if squared < 1.5:
-            share *= max((squared - 0.7) / 0.8, 0.0)
-    return share
+        lamps[n] = whitening[n] @ (lamp - centres[n])
+    p = np.empty(3)
+    for i in range(size):
+        for j in range(size):
+            p[0] = room[0] + (j + 0.5) / size * (room[3] - room[0])
+            p[1] = room[1] + (i + 0.5) / size * (room[4] - room[1])
+            p[2] = height
+            left = 1.0
+            for n in range(len(centres)):
+                # Where is the line from here to the lamp nearest to the ellipsoid, and how near?
+                o = whitening[n] @ (p - centres[n])
+                d = lamps[n] - o
+                along = min(max(-(o @ d) / (d @ d), 0.0), 1.0)
+                o += along * d
+                squared = o @ o
+                if squared < 1.5:
+                    left *= max((squared - 0.7) / 0.8, 0.0)
+            share[i, j] = left
 
 
 @numba.njit(cache=True)
 def shade(  # type: ignore[no-untyped-def]
-    K, T_world_camera, ids, depths, centres, whitening, patterns, numbers, colours, surfaces, lattice, light, out
+    K,
+    T_world_camera,
+    ids,
+    depths,
+    centres,
+    whitening,
+    patterns,
+    numbers,
+    colours,
+    surfaces,
+    lattice,
+    light,
+    room,
+    shadows,
+    out,
 ):
     """Linear light (H, W, 3) float32 that comes from what each pixel sees, written to `out`.
 
@@ -196,14 +217,13 @@ def shade(  # type: ignore[no-untyped-def]
         surfaces: (6, S, S, 3) textures of the room, by -1 - id; periodic, `TEXELS` per metre.
         lattice: (NOISE_SIZE,) * 3 random numbers.
         light: (8,) position of the lamp [m], its colour, the ambient share, the distance at which it is 1 [m].
+        room: as in `cast`.
+        shadows: (2, S, S) from `cast_shadows`, of the floor and of the table.
     """
     height, width = ids.shape
-    size = surfaces.shape[1]
+    size, last = surfaces.shape[1], shadows.shape[1] - 1
     R = T_world_camera[:3, :3]
     eye = T_world_camera[:3, 3]
-    lamps = np.empty_like(centres)
-    for n in range(len(centres)):
-        lamps[n] = whitening[n] @ (light[:3] - centres[n])
     q, p, normal, colour = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
     for i in range(height):
         y = (i + 0.5 - K[1, 2]) / K[1, 1]
@@ -243,7 +263,9 @@ def shade(  # type: ignore[no-untyped-def]
             cosine = max((normal[0] * to0 + normal[1] * to1 + normal[2] * to2) / distance, 0.0)
             direct = cosine * (light[7] / (distance + 0.5 * light[7])) ** 2
             if n in (TABLE, FLOOR):
-                direct *= _shadow(p, centres, whitening, lamps)
+                column = min(max(int((p[0] - room[0]) / (room[3] - room[0]) * last), 0), last)
+                row = min(max(int((p[1] - room[1]) / (room[4] - room[1]) * last), 0), last)
+                direct *= shadows[1 if n == TABLE else 0, row, column]
             shine = 0.0
             if gloss > 0.0:  # Blinn's half-way vector
                 h0, h1, h2 = to0 / distance, to1 / distance, to2 / distance

@@ -98,7 +98,6 @@ def _smear(light, depths, K, T_end_start, aperture, inverse_focus, out):  # type
     height, width = depths.shape
     fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
     T = T_end_start
-    total = np.empty(3)
     for i in range(height):
         for j in range(width):
             z = depths[i, j]
@@ -114,7 +113,7 @@ def _smear(light, depths, K, T_end_start, aperture, inverse_focus, out):  # type
                     out[i, j, a] = light[i, j, a]
                 continue
             samples = min(3 + int(1.5 * extent), MAX_SAMPLES)
-            total[:] = 0.0
+            red, green, blue = 0.0, 0.0, 0.0
             for s in range(samples):
                 u = j + BLUR_SAMPLES[samples, s, 2] * flow_x + disc * BLUR_SAMPLES[samples, s, 0]
                 v = i + BLUR_SAMPLES[samples, s, 2] * flow_y + disc * BLUR_SAMPLES[samples, s, 1]
@@ -122,11 +121,11 @@ def _smear(light, depths, K, T_end_start, aperture, inverse_focus, out):  # type
                 c, w = int(u), int(v)
                 u, v = u - c, v - w
                 a00, a01, a10, a11 = (1 - u) * (1 - v), u * (1 - v), (1 - u) * v, u * v
-                for a in range(3):
-                    top = a00 * light[w, c, a] + a01 * light[w, c + 1, a]
-                    total[a] += top + a10 * light[w + 1, c, a] + a11 * light[w + 1, c + 1, a]
-            for a in range(3):
-                out[i, j, a] = total[a] / samples
+                e, f = c + 1, w + 1
+                red += a00 * light[w, c, 0] + a01 * light[w, e, 0] + a10 * light[f, c, 0] + a11 * light[f, e, 0]
+                green += a00 * light[w, c, 1] + a01 * light[w, e, 1] + a10 * light[f, c, 1] + a11 * light[f, e, 1]
+                blue += a00 * light[w, c, 2] + a01 * light[w, e, 2] + a10 * light[f, c, 2] + a11 * light[f, e, 2]
+            out[i, j, 0], out[i, j, 1], out[i, j, 2] = red / samples, green / samples, blue / samples
 
 
 @numba.njit(cache=True)
