@@ -35,6 +35,9 @@ LOSSES: dict[str, tuple[Callable[[], torch.nn.Module] | None, float]] = {
 }
 
 
+HELD_OUT = 0.2  # share of the examples, those of the last images, that decide which weights are kept
+
+
 @dataclass(frozen=True)
 class Examples:
     """Detections that are of a labelled object, M of them in N images.
@@ -104,21 +107,31 @@ def _examples(model: CalibratedDetector, regions: Regions, detected: np.ndarray,
 def covariance_task(
     model: CalibratedDetector, examples: Examples, loss: str, batch: int, settings: LoopSettings, device: torch.device
 ) -> Task:
-    """The loss of `LOSSES` on batches of examples; only the covariance head changes."""
+    """The loss of `LOSSES` on batches of examples; only the covariance head changes.
+
+    The weights of the best likelihood of held-out examples are kept: a head of so many weights soon knows its examples
+    by heart, and then claims too much of others.
+    """
     model.to(device).eval().requires_grad_(False)
     head = model.covariance_head.train().requires_grad_(True)
     risk = GaussianNLL()
     make, weight = LOSSES[loss]
     calibration = make() if make is not None else None
 
-    def losses(step: int) -> dict[str, Tensor]:
-        chosen = torch.from_numpy(batch_of(step, min(batch, len(examples)), len(examples), settings.seed))
+    learnt = len(examples) - round(HELD_OUT * len(examples))
+
+    def predict(chosen: Tensor) -> tuple[Tensor, Tensor]:
+        """Residuals that are independent of each other, and their variances."""
         features, geometries, labels, residuals = (
             part[chosen].to(device)
             for part in (examples.features, examples.geometries, examples.labels, examples.residuals)
         )
         variances, couplings = head(features, geometries, labels)
-        independent = decoupled(residuals, couplings)
+        return decoupled(residuals, couplings), variances
+
+    def losses(step: int) -> dict[str, Tensor]:
+        chosen = torch.from_numpy(batch_of(step, min(batch, learnt), learnt, settings.seed))
+        independent, variances = predict(chosen)
         zero = torch.zeros_like(independent)
         found = {"nll": (1.0 - weight) * risk(zero, variances, independent)}
         if calibration is not None:
@@ -127,7 +140,12 @@ def covariance_task(
             found["calibration"] = weight * calibration(zero[whole], variances[whole], independent[whole])
         return found
 
-    return Task(module=head, parameters=list(head.parameters()), losses=losses, device=device)
+    @torch.no_grad()
+    def held_out() -> float:
+        independent, variances = predict(torch.arange(learnt, len(examples)))
+        return float(risk(torch.zeros_like(independent), variances, independent))
+
+    return Task(head, list(head.parameters()), losses, device, held_out=held_out)
 
 
 def stored_examples(path: Path, make: Callable[[], Examples]) -> Examples:

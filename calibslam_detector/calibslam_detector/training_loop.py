@@ -65,6 +65,8 @@ class Task:
         losses: names and values at a step; their sum is made smaller. None: nothing to learn from this step.
         finite_everywhere: whether a loss that is finite here is so in all processes.
         is_first: whether this process writes files and shows progress.
+        held_out: a loss on samples that are not learnt from; measured with each line of the log, and in the end the
+            weights are those of the least one. None: the last weights.
     """
 
     module: nn.Module
@@ -73,6 +75,7 @@ class Task:
     device: torch.device
     everywhere: Callable[[bool], bool] = bool
     is_first: bool = True
+    held_out: Callable[[], float] | None = None
 
 
 def optimise(task: Task, settings: LoopSettings, folder: Path, identity: dict[str, Any], resume: bool) -> None:
@@ -92,7 +95,9 @@ def optimise(task: Task, settings: LoopSettings, folder: Path, identity: dict[st
     optimiser = torch.optim.AdamW(task.parameters, settings.learning_rate, weight_decay=settings.weight_decay)
     amp = settings.amp and task.device.type == "cuda"
     scaler = torch.amp.GradScaler(task.device.type, enabled=amp)
-    checkpoint = Checkpoint(folder / "checkpoint.pt", identity, task.module, optimiser, scaler)
+    best = Best()
+    parts = {"module": task.module, "optimiser": optimiser, "scaler": scaler, "best": best}
+    checkpoint = Checkpoint(folder / "checkpoint.pt", identity, parts)
     first = checkpoint.load() if resume else 0
     log = Log(folder / "log.csv", first) if task.is_first else None
     started, skipped = time.monotonic(), 0
@@ -124,6 +129,9 @@ def optimise(task: Task, settings: LoopSettings, folder: Path, identity: dict[st
                 scaler.update()
                 if log is not None and losses is not None and step % settings.log_every == 0:
                     values = {name: float(value.detach()) for name, value in losses.items()}
+                    if task.held_out is not None:
+                        values["held_out"] = task.held_out()
+                        best.offer(values["held_out"], task.module)
                     log.add(step, time.monotonic() - started, settings.rate(step), values)
                     progress.set_postfix(loss=f"{float(total.detach()):.4g}")
             progress.update()
@@ -135,15 +143,42 @@ def optimise(task: Task, settings: LoopSettings, folder: Path, identity: dict[st
                     plot_curves(log.path, folder / "curves.png")
             if stopped and done < settings.steps:
                 raise Interrupted(f"stopped after step {done} of {settings.steps}; go on with --resume")
+    best.restore(task.module)
+
+
+class Best:
+    """The weights with the least loss on held-out samples."""
+
+    def __init__(self) -> None:
+        self._loss, self._weights = math.inf, dict[str, Tensor]()
+
+    def offer(self, loss: float, module: nn.Module) -> None:
+        """Keep a module's weights if they are the best so far."""
+        if loss < self._loss:
+            self._loss = loss
+            self._weights = {name: value.detach().clone() for name, value in module.state_dict().items()}
+
+    def restore(self, module: nn.Module) -> None:
+        """Give a module the best weights; as it is where none were offered."""
+        if self._weights:
+            module.load_state_dict(self._weights)
+
+    def state_dict(self) -> dict[str, Any]:
+        """For a checkpoint."""
+        return {"loss": self._loss, "weights": self._weights}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """From a checkpoint."""
+        self._loss, self._weights = state["loss"], state["weights"]
 
 
 class Checkpoint:
-    """All that decides what the next steps do."""
+    """All that decides what the next steps do: the parts, each with state_dict and load_state_dict."""
 
-    def __init__(self, path: Path, identity: dict[str, Any], module: nn.Module, optimiser: Any, scaler: Any) -> None:
+    def __init__(self, path: Path, identity: dict[str, Any], parts: dict[str, Any]) -> None:
         self.path = path
         self._identity = identity
-        self._parts = {"module": module, "optimiser": optimiser, "scaler": scaler}
+        self._parts = parts
 
     def save(self, step: int) -> None:
         """Write the state after so many steps."""

@@ -202,6 +202,34 @@ def test_a_loss_that_is_not_finite_ends_training_with_the_last_good_state(tmp_pa
     assert len(rows(tmp_path)) == 3
 
 
+def test_the_weights_of_the_best_held_out_loss_are_kept(tmp_path: Path) -> None:
+    module = torch.nn.Linear(1, 1, bias=False)
+    seen = []
+
+    def held_out() -> float:
+        seen.append(float(module.weight.detach()))
+        return [3.0, 1.0, 2.0, 4.0, 5.0, 6.0][len(seen) - 1]
+
+    def task() -> Task:
+        losses = {"loss": lambda: module.weight.square().sum()}
+        return Task(
+            module,
+            list(module.parameters()),
+            lambda step: {name: loss() for name, loss in losses.items()},
+            torch.device("cpu"),
+            held_out=held_out,
+        )
+
+    settings = LoopSettings(steps=4, checkpoint_every=1, log_every=1, warm_up=0, learning_rate=0.1)
+    optimise(task(), settings, tmp_path, {}, resume=False)
+    assert len(set(seen)) == 4 and float(module.weight.detach()) == seen[1]
+    assert [row["held_out"] for row in rows(tmp_path)] == ["3", "1", "2", "4"]
+    # What a checkpoint knows of it is not lost.
+    torch.nn.init.zeros_(module.weight)
+    optimise(task(), settings, tmp_path, {}, resume=True)
+    assert float(module.weight.detach()) == seen[1]
+
+
 def test_the_learning_rate_rises_and_falls() -> None:
     settings = LoopSettings(steps=100, learning_rate=1.0, warm_up=9)
     assert settings.rate(0) == pytest.approx(0.1)
@@ -255,7 +283,7 @@ def test_both_stages_and_evaluation(data: Path, tmp_path: Path, monkeypatch: pyt
     trained = weights_file.load(out / "weights.pt")
     for name, value in model.detector.state_dict().items():
         assert torch.equal(trained.detector.state_dict()[name], value), name
-    assert [set(row) for row in rows(out)] == [{"step", "learning_rate", "nll"}] * 3
+    assert [set(row) for row in rows(out)] == [{"step", "learning_rate", "nll", "held_out"}] * 3
     (out / "weights.pt").unlink()
     assert train.main([str(data), *options, "--log-every", "1", "--out", str(out), "--resume"]) == 0
     arguments = [
