@@ -16,7 +16,7 @@ from calibslam_sim.experiments.statistics import defined, half_interval
 matplotlib.use("Agg")
 from matplotlib import pyplot as plt
 from matplotlib.axes import Axes
-from matplotlib.ticker import FixedLocator, FuncFormatter, LogLocator, NullLocator
+from matplotlib.ticker import FixedLocator, FuncFormatter, LogLocator, MaxNLocator, NullLocator
 
 STYLES = ("o-", "s--", "^:", "D-.")
 COLOURS = ("tab:blue", "tab:orange", "tab:green", "tab:purple")
@@ -111,6 +111,7 @@ def condition_figure(
                 )
         panel.set_yticks(places, conditions if i % columns == 0 else [""] * len(conditions))
         panel.set_ylim(-0.6, len(conditions) - 0.4)
+        panel.xaxis.set_major_locator(MaxNLocator(5))
         panel.set_xlabel(named.label)
         panel.grid(alpha=0.3)
     for panel in axes.flat[len(metrics) :]:
