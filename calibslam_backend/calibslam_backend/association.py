@@ -8,11 +8,13 @@ keyframes agree: one coincidence costs nothing, one wrong binding costs the map.
 
 from __future__ import annotations
 
+import functools
 import math
 from collections import Counter
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 from scipy.stats import chi2
 
@@ -44,6 +46,12 @@ class AssociationSettings(Settings):
         "distance of two centres below which they are one object, as a share of the sum of their radii",
         low=0.0,
     )
+
+
+@functools.cache
+def gate_of(probability: float) -> float:
+    """Squared Mahalanobis distance within which a box of four edges lies with this probability."""
+    return float(chi2.ppf(probability, 4))
 
 
 @dataclass(frozen=True)
@@ -102,7 +110,7 @@ def distances(
     predictions: list[Prediction], boxes: list[BoxMeasurement], classes: list[str], settings: AssociationSettings
 ) -> Array:
     """Negative log-likelihood (landmarks, boxes) of a pair; infinite outside the gate."""
-    gate = chi2.ppf(settings.gate, 4)
+    gate = gate_of(settings.gate)
     result = np.full((len(predictions), len(boxes)), np.inf)
     for b, box in enumerate(boxes):
         measured = np.linalg.inv(box.whitener.T @ box.whitener)
@@ -146,8 +154,9 @@ class Votes:
         self._votes.pop(track, None)
 
 
-def same_object(a: Array, b: Array, merge_distance: float) -> bool:
-    """Whether two quadrics, vectors (9,), are so close, and so alike in size, that they are one object."""
-    distance = math.dist(a[:3], b[:3])
-    sizes = [mean_radius(vector) for vector in (a, b)]
-    return distance < merge_distance * sum(sizes) and max(sizes) < SIZE_RATIO * min(sizes)
+def same_object(vector: Array, others: Array, merge_distance: float) -> NDArray[np.bool_]:
+    """Which of M quadrics (M, 9) are so close to one (9,), and so alike in size, that they are one object."""
+    distances = np.linalg.norm(others[:, :3] - vector[:3], axis=1)
+    size, sizes = mean_radius(vector), mean_radius(others)
+    alike = np.maximum(size, sizes) < SIZE_RATIO * np.minimum(size, sizes)
+    return np.asarray(alike & (distances < merge_distance * (size + sizes)))

@@ -6,7 +6,7 @@ A track is open until it is bound to a quadric, which happens when several keyfr
 
 from __future__ import annotations
 
-import math
+import functools
 from collections import Counter
 from collections.abc import Iterable, Set
 from dataclasses import dataclass, field
@@ -52,6 +52,11 @@ class Frame:
     classes: tuple[str, ...]
     names: tuple[str, ...]
     quadrics: list[int | None]
+
+    @functools.cached_property
+    def arrays(self) -> list[Array]:
+        """(N, ...) corners, whiteners, bounds and clip of the boxes."""
+        return [np.stack([getattr(b, name) for b in self.boxes]) for name in ("corners", "whitener", "bounds", "clip")]
 
 
 @dataclass
@@ -249,19 +254,16 @@ class DataAssociation:
         """The quadric that this one is, if the map has it."""
         if self.settings.association == GIVEN:
             return None
-        best: int | None = None
-        nearest = np.inf
-        for j in self._graph.landmarks:
-            other = self._graph.quadric(j)
-            distance = math.dist(other[:3], vector[:3])
-            if (
-                distance < nearest
-                and same_object(vector, other, self.settings.merge_distance)
-                and self.classes[j].keys() & candidate.classes.keys()
-                and not self._seen_apart(candidate, j)
-            ):
-                best, nearest = j, distance
-        return best
+        ids = list(self._graph.landmarks)
+        if not ids:
+            return None
+        vectors = np.stack([self._graph.quadric(j) for j in ids])
+        same = same_object(vector, vectors, self.settings.merge_distance)
+        for n in np.argsort(np.linalg.norm(vectors[:, :3] - vector[:3], axis=1)):
+            j = ids[n]
+            if same[n] and self.classes[j].keys() & candidate.classes.keys() and not self._seen_apart(candidate, j):
+                return j
+        return None
 
     def revise(self, number: int | None = None) -> int:
         """Judge anew whose the boxes of earlier keyframes are; returns how many changed hands.
@@ -295,13 +297,15 @@ class DataAssociation:
 
     def _revise_frame(self, k: int, ids: list[int], quadrics: Array) -> int:
         frame = self.frames[k]
+        if not frame.boxes:
+            return 0
         by_track = [
             Counter(j for i, m in self._candidates[t].seen if (j := self.frames[i].quadrics[m]) is not None)
             for t in frame.tracks
         ]
         revised = revise(
             self._graph.pose(k),
-            frame.boxes,
+            frame.arrays,
             frame.classes,
             by_track,
             quadrics,
@@ -340,26 +344,20 @@ class DataAssociation:
                 self._unite(j, known)
                 gone.append(j)
         self._same.clear()
-        for j in sorted(self._graph.landmarks, reverse=True):
-            target = self._older_twin(j)
-            if target is not None:
-                self._unite(j, target)
-                gone.append(j)
+        ids = sorted(self._graph.landmarks)
+        if not ids:
+            return gone
+        vectors = np.stack([self._graph.quadric(j) for j in ids])
+        for m in reversed(range(len(ids))):
+            # An older quadric of its place, size and class, never seen beside it, is the same object.
+            for n in np.flatnonzero(same_object(vectors[m], vectors[:m], self.settings.merge_distance)):
+                j, older = ids[m], ids[n]
+                boxes, others = (self._graph.landmarks[i].boxes.keys() for i in (j, older))
+                if self.class_of_quadric(older) == self.class_of_quadric(j) and not _apart(boxes, others):
+                    self._unite(j, older)
+                    gone.append(j)
+                    break
         return gone
-
-    def _older_twin(self, j: int) -> int | None:
-        """An older quadric that is the same object: of its place, size and class, and never seen beside it."""
-        vector, frames = self._graph.quadric(j), self._graph.landmarks[j].boxes.keys()
-        for i in sorted(self._graph.landmarks):
-            if i >= j:
-                break
-            if (
-                same_object(vector, self._graph.quadric(i), self.settings.merge_distance)
-                and self.class_of_quadric(i) == self.class_of_quadric(j)
-                and not _apart(frames, self._graph.landmarks[i].boxes.keys())
-            ):
-                return i
-        return None
 
     def note(self, report: UpdateReport) -> None:
         """Book what the graph took out: its boxes and tracks are open again."""

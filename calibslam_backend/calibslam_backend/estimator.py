@@ -17,8 +17,8 @@ from bisect import insort
 from collections import Counter
 from dataclasses import dataclass
 
+import gtsam
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from calibslam_backend.association import GIVEN
 from calibslam_backend.box_measurement import undistorted
@@ -290,7 +290,7 @@ class Estimator:
 
     def _moved(self, motion: Array, duration: int) -> bool:
         s = self.settings
-        rotation = float(np.linalg.norm(Rotation.from_matrix(motion[:3, :3]).as_rotvec()))
+        rotation = float(np.linalg.norm(gtsam.Rot3.Logmap(gtsam.Rot3(motion[:3, :3]))))
         translation = float(np.linalg.norm(motion[:3, 3]))
         return (
             rotation / max(s.keyframe_rotation, 1e-9) + translation / max(s.keyframe_translation, 1e-9) >= 1.0

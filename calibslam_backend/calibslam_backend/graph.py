@@ -109,7 +109,7 @@ class ObjectGraph:
 
     def poses(self) -> Array:
         """(N, 4, 4) of all keyframes."""
-        return np.stack([self.pose(k) for k in range(self.size)]) if self.size else np.empty((0, 4, 4))
+        return _poses(self._smoother.values)
 
     def odometry(self) -> tuple[Array, Array]:
         """What odometry alone says: poses (N, 4, 4) and their covariances (N, 6, 6), from the same origin."""
@@ -261,12 +261,11 @@ class ObjectGraph:
 
     def _jumped(self, before: gtsam.Values) -> bool:
         """Whether a pose moved farther than an undamped step can be trusted with."""
-        now = self._smoother.values
-        for k in range(self.size):
-            step = gtsam.Pose3.Logmap(before.atPose3(_x(k)).between(now.atPose3(_x(k))))
-            if not np.isfinite(step).all() or np.abs(step).max() > self.LARGEST_STEP:
-                return True
-        return False
+        old, new = _poses(before), _poses(self._smoother.values)
+        moved = np.linalg.norm(new[:, :3, 3] - old[:, :3, 3], axis=1)
+        # The norm of the difference of two rotations is 2 sqrt(2) sin(angle / 2).
+        turned = np.linalg.norm(new[:, :3, :3] - old[:, :3, :3], axis=(1, 2)) / np.sqrt(2.0)
+        return not bool((moved < self.LARGEST_STEP).all() and (turned < self.LARGEST_STEP).all())
 
     def _repair(self, before: gtsam.Values) -> None:
         """Optimise the whole graph with damping from an estimate that was good, and build the tree anew.
@@ -285,6 +284,15 @@ class ObjectGraph:
                 log.warning("%s; giving up quadric %d", _first_sentence(error), youngest)
                 self.remove_quadric(youngest)
                 before.erase(_q(youngest))
+
+
+def _poses(values: gtsam.Values) -> Array:
+    """(N, 4, 4) of all poses, in their order."""
+    rows = gtsam.utilities.extractPose3(values)  # rotation by rows, translation
+    poses = np.tile(np.eye(4), (len(rows), 1, 1))
+    poses[:, :3, :3] = rows[:, :9].reshape(-1, 3, 3)
+    poses[:, :3, 3] = rows[:, 9:]
+    return poses
 
 
 def _x(k: int) -> int:

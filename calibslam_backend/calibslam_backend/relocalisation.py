@@ -71,7 +71,7 @@ def relocalise(
     if len(boxes) < settings.relocalisation_boxes or np.count_nonzero(compatible) < settings.relocalisation_boxes:
         return None
     corners = np.stack([box.corners for box in boxes])
-    surfaces, sizes = shapes(quadrics), np.array([mean_radius(vector) for vector in quadrics])
+    surfaces, sizes = shapes(quadrics), mean_radius(quadrics)
     size, centres = np.array(image, dtype=np.float64), np.ascontiguousarray(quadrics[:, :3])
 
     def overlaps(T: Array) -> Array:
