@@ -103,8 +103,9 @@ class Estimator:
         Raises:
             InvalidMeasurement: see `MotionChain.add`; nothing is changed.
         """
-        if not self._motions.add(motion):
-            self.counts["odometry_gap"] += 1
+        problem = self._motions.add(motion)
+        if problem:
+            self.counts[problem] += 1
         self.counts["motions"] += 1
         return self._process()
 
