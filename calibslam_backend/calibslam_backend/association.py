@@ -39,6 +39,9 @@ class AssociationSettings(Settings):
     model_error: float = setting(
         0.2, "error of the ellipsoid as a model of the object, as a share of its box", low=0.0, high=1.0
     )
+    ambiguity: float = setting(
+        3.0, "log of the odds over the second best quadric below which a decision waits", low=0.0, high=100.0
+    )
     revised: int = setting(10, "earlier keyframes, with each new one, whose boxes are judged anew", low=0)
     wrong_class: float = setting(0.05, "share of boxes that carry a wrong class", low=1e-6, high=0.5)
     merge_distance: float = setting(
@@ -133,6 +136,16 @@ def assign(cost: Array) -> list[tuple[int, int]]:
     forbidden = np.abs(cost[np.isfinite(cost)]).sum() * 2.0 + 1e6
     pairs = zip(*linear_sum_assignment(np.where(np.isfinite(cost), cost, forbidden)), strict=True)
     return [(int(r), int(c)) for r, c in pairs if np.isfinite(cost[r, c])]
+
+
+def unambiguous(cost: Array, pairs: list[tuple[int, int]], ambiguity: float) -> list[tuple[int, int]]:
+    """Of assigned pairs (row, column) those whose column no other row would suit nearly as well."""
+    others = [np.delete(cost[:, column], row) for row, column in pairs]
+    return [
+        (row, column)
+        for (row, column), rest in zip(pairs, others, strict=True)
+        if not len(rest) or rest.min() - cost[row, column] >= ambiguity
+    ]
 
 
 class Votes:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import functools
 from collections import Counter
 from collections.abc import Iterable, Set
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -22,6 +22,7 @@ from calibslam_backend.association import (
     predict,
     predicted_corners,
     same_object,
+    unambiguous,
 )
 from calibslam_backend.box_measurement import BoxMeasurement, prepare
 from calibslam_backend.estimator_settings import EstimatorSettings
@@ -29,7 +30,7 @@ from calibslam_backend.graph import ObjectGraph, UpdateReport
 from calibslam_backend.initialisation import initialise
 from calibslam_backend.localisation import localise
 from calibslam_backend.noise import NoiseModel
-from calibslam_backend.relocalisation import relocalise
+from calibslam_backend.relocalisation import Relocalised, relocalise
 from calibslam_backend.revision import revise
 from calibslam_backend.tracking import overlap
 from calibslam_msgs_py.measurements import Array, Boxes, Camera
@@ -182,8 +183,29 @@ class DataAssociation:
                 predictions.append(Prediction(j, *prediction, self.class_of_quadric(j)))
         classes = [self._candidates[frame.tracks[n]].classes.most_common(1)[0][0] for n in rows]
         cost = distances(predictions, open_boxes, classes, self.settings)
-        for p, r in assign(cost):
+        for p, r in unambiguous(cost, assign(cost), self.settings.ambiguity):
             self._vote_for(frame.tracks[rows[r]], predictions[p].landmark)
+
+    def find(self, frame: Frame) -> Relocalised | None:
+        """Where in a loaded map a camera with these boxes is."""
+        known = list(self._graph.landmarks)
+        classes = np.array([self.class_of_quadric(j) for j in known])
+        found = relocalise(
+            None,
+            frame.boxes,
+            np.stack([self._graph.quadric(j) for j in known]),
+            np.reshape([classes == self._class_of(track) for track in frame.tracks], (-1, len(known))),
+            self.camera.K,
+            (self.camera.width, self.camera.height),
+            self.settings.robust_scale,
+            self.settings,
+        )
+        return found and replace(found, pairs=[(n, known[m]) for n, m in found.pairs])
+
+    def bind_found(self, frame: Frame, found: Relocalised) -> None:
+        """The boxes of the keyframe where the camera was found belong to the quadrics that it was found by."""
+        for n, j in found.pairs:
+            self._bind(frame.tracks[n], j)
 
     def _vote_for(self, track: int, landmark: int) -> None:
         decided = self._votes.add(track, landmark)

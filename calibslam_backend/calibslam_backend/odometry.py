@@ -17,7 +17,6 @@ import numpy as np
 from calibslam_msgs_py.measurements import SECOND, Array, InvalidMeasurement, RelativeMotion
 from calibslam_msgs_py.settings import Settings, setting
 
-
 SHORTEST = 0.03  # [s]: in shorter motions, noise looks like acceleration
 EXPLAINED = 3.0  # standard deviations
 
@@ -142,6 +141,7 @@ class MotionChain:
         self._extrinsic = gtsam.Pose3(T_body_camera)
         self._times: list[int] = []  # ends of steps; the first is the start of the chain
         self._poses: list[gtsam.Pose3] = []  # camera in the chain's own frame, at those times
+        self._measured: list[gtsam.Pose3] = []  # the same, nothing bridged
         self._covariances: list[Array | None] = []  # of the step that ends there
         self._unseen: list[float] = []  # what the body may have done unseen in that step [rad and m]
         self._velocities: list[Array] = []  # of the last possible step and of the last one, possible or not
@@ -175,7 +175,7 @@ class MotionChain:
             to_camera = self._extrinsic.inverse().AdjointMap()
             covariance = to_camera @ covariance @ to_camera.T
         if not self._times:
-            self._append(motion.start, gtsam.Pose3(), None, 0.0)
+            self._append(motion.start, gtsam.Pose3(), gtsam.Pose3(), None, 0.0)
         last = self._times[-1]
         if motion.start < last:
             raise InvalidMeasurement(
@@ -186,7 +186,7 @@ class MotionChain:
         if motion.start > last:
             problem = "odometry_gap"
             unseen = self.UNSEEN_MOTION * (motion.start - last) / SECOND
-            self._append(motion.start, self._poses[-1], np.zeros((6, 6)), unseen)
+            self._append(motion.start, gtsam.Pose3(), gtsam.Pose3(), np.zeros((6, 6)), unseen)
             self._velocities.clear()
         seconds = (motion.end - motion.start) / SECOND
         step = self._extrinsic.inverse() * gtsam.Pose3(motion.T_start_end) * self._extrinsic
@@ -194,11 +194,11 @@ class MotionChain:
         near = [self._noise.is_plausible(velocity, before, seconds, covariance) for before in self._velocities]
         if any(near) or not near:
             self._velocities = [velocity, velocity]
-            self._append(motion.end, self._poses[-1] * step, covariance, 0.0)
+            self._append(motion.end, step, step, covariance, 0.0)
             return problem
         self._velocities[1] = velocity
-        step = gtsam.Pose3.Expmap(self._velocities[0] * seconds)
-        self._append(motion.end, self._poses[-1] * step, covariance, self.UNSEEN_MOTION * seconds)
+        coasting = gtsam.Pose3.Expmap(self._velocities[0] * seconds)
+        self._append(motion.end, coasting, step, covariance, self.UNSEEN_MOTION * seconds)
         return "odometry_implausible"
 
     def between(self, start: int, end: int) -> tuple[Array, Array]:
@@ -206,7 +206,7 @@ class MotionChain:
 
         Both times must lie inside the chain.
         """
-        first, last = self._pose_at(start), self._pose_at(end)
+        first, last = self._pose_at(start, self._poses), self._pose_at(end, self._poses)
         motion = first.between(last)
         covariance, unseen, unknown = np.zeros((6, 6)), 0.0, False
         for i in range(bisect_right(self._times, start), len(self._times)):
@@ -219,7 +219,7 @@ class MotionChain:
             if known is None:
                 unknown = True
             else:
-                to_end = last.inverse().compose(self._pose_at(finish)).AdjointMap()
+                to_end = last.inverse().compose(self._pose_at(finish, self._poses)).AdjointMap()
                 covariance += to_end @ (share * known) @ to_end.T
         if unknown:
             covariance = self._noise.covariance(motion.matrix())
@@ -228,7 +228,12 @@ class MotionChain:
     def forget_before(self, time: int) -> None:
         """Drop what is not needed to read times from `time` [ns] on."""
         keep = max(bisect_right(self._times, time) - 1, 0)
-        del self._times[:keep], self._poses[:keep], self._covariances[:keep], self._unseen[:keep]
+        del self._times[:keep], self._poses[:keep], self._measured[:keep]
+        del self._covariances[:keep], self._unseen[:keep]
+
+    def measured(self, start: int, end: int) -> Array:
+        """Motion (4, 4) of the camera from start to end [ns] as odometry said, possible or not."""
+        return np.asarray(self._pose_at(start, self._measured).between(self._pose_at(end, self._measured)).matrix())
 
     def drifts(self, start: int, end: int) -> float:
         """How long [s] the motion from start to end [ns] drifts: all the time if its covariance is not known."""
@@ -236,20 +241,19 @@ class MotionChain:
         unknown = any(self._covariances[i] is None for i in steps if i < len(self._times))
         return (end - start) / SECOND if unknown else 0.0
 
-    def clear(self) -> None:
-        """Forget everything."""
-        del self._times[:], self._poses[:], self._covariances[:], self._unseen[:], self._velocities[:]
-
-    def _append(self, time: int, pose: gtsam.Pose3, covariance: Array | None, unseen: float) -> None:
+    def _append(
+        self, time: int, step: gtsam.Pose3, measured: gtsam.Pose3, covariance: Array | None, unseen: float
+    ) -> None:
         self._times.append(time)
-        self._poses.append(pose)
+        self._poses.append(self._poses[-1] * step if self._poses else step)
+        self._measured.append(self._measured[-1] * measured if self._measured else measured)
         self._covariances.append(covariance)
         self._unseen.append(unseen)
 
-    def _pose_at(self, time: int) -> gtsam.Pose3:
+    def _pose_at(self, time: int, poses: list[gtsam.Pose3]) -> gtsam.Pose3:
         i = bisect_right(self._times, time) - 1
         if i == len(self._times) - 1:
-            return self._poses[i]
+            return poses[i]
         share = (time - self._times[i]) / (self._times[i + 1] - self._times[i])
-        step = gtsam.Pose3.Logmap(self._poses[i].between(self._poses[i + 1]))
-        return self._poses[i].compose(gtsam.Pose3.Expmap(share * step))
+        step = gtsam.Pose3.Logmap(poses[i].between(poses[i + 1]))
+        return poses[i].compose(gtsam.Pose3.Expmap(share * step))
