@@ -8,11 +8,13 @@ keyframes agree: one coincidence costs nothing, one wrong binding costs the map.
 
 from __future__ import annotations
 
+import functools
 import math
 from collections import Counter
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 from scipy.stats import chi2
 
@@ -37,6 +39,9 @@ class AssociationSettings(Settings):
     model_error: float = setting(
         0.2, "error of the ellipsoid as a model of the object, as a share of its box", low=0.0, high=1.0
     )
+    ambiguity: float = setting(
+        3.0, "log of the odds over the second best quadric below which a decision waits", low=0.0, high=100.0
+    )
     revised: int = setting(10, "earlier keyframes, with each new one, whose boxes are judged anew", low=0)
     wrong_class: float = setting(0.05, "share of boxes that carry a wrong class", low=1e-6, high=0.5)
     merge_distance: float = setting(
@@ -44,6 +49,12 @@ class AssociationSettings(Settings):
         "distance of two centres below which they are one object, as a share of the sum of their radii",
         low=0.0,
     )
+
+
+@functools.cache
+def gate_of(probability: float) -> float:
+    """Squared Mahalanobis distance within which a box of four edges lies with this probability."""
+    return float(chi2.ppf(probability, 4))
 
 
 @dataclass(frozen=True)
@@ -102,7 +113,7 @@ def distances(
     predictions: list[Prediction], boxes: list[BoxMeasurement], classes: list[str], settings: AssociationSettings
 ) -> Array:
     """Negative log-likelihood (landmarks, boxes) of a pair; infinite outside the gate."""
-    gate = chi2.ppf(settings.gate, 4)
+    gate = gate_of(settings.gate)
     result = np.full((len(predictions), len(boxes)), np.inf)
     for b, box in enumerate(boxes):
         measured = np.linalg.inv(box.whitener.T @ box.whitener)
@@ -127,6 +138,16 @@ def assign(cost: Array) -> list[tuple[int, int]]:
     return [(int(r), int(c)) for r, c in pairs if np.isfinite(cost[r, c])]
 
 
+def unambiguous(cost: Array, pairs: list[tuple[int, int]], ambiguity: float) -> list[tuple[int, int]]:
+    """Of assigned pairs (row, column) those whose column no other row would suit nearly as well."""
+    others = [np.delete(cost[:, column], row) for row, column in pairs]
+    return [
+        (row, column)
+        for (row, column), rest in zip(pairs, others, strict=True)
+        if not len(rest) or rest.min() - cost[row, column] >= ambiguity
+    ]
+
+
 class Votes:
     """For each open track, how often which landmark was its best match."""
 
@@ -146,8 +167,9 @@ class Votes:
         self._votes.pop(track, None)
 
 
-def same_object(a: Array, b: Array, merge_distance: float) -> bool:
-    """Whether two quadrics, vectors (9,), are so close, and so alike in size, that they are one object."""
-    distance = math.dist(a[:3], b[:3])
-    sizes = [mean_radius(vector) for vector in (a, b)]
-    return distance < merge_distance * sum(sizes) and max(sizes) < SIZE_RATIO * min(sizes)
+def same_object(vector: Array, others: Array, merge_distance: float) -> NDArray[np.bool_]:
+    """Which of M quadrics (M, 9) are so close to one (9,), and so alike in size, that they are one object."""
+    distances = np.linalg.norm(others[:, :3] - vector[:3], axis=1)
+    size, sizes = mean_radius(vector), mean_radius(others)
+    alike = np.maximum(size, sizes) < SIZE_RATIO * np.minimum(size, sizes)
+    return np.asarray(alike & (distances < merge_distance * (size + sizes)))

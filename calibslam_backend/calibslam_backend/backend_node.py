@@ -28,6 +28,7 @@ from calibslam_backend.kernels import load_kernels
 from calibslam_backend.map_to_odom_node import MapToOdom
 from calibslam_backend.object_map import MapFileError, ObjectMap
 from calibslam_backend.published import MAP, POSE, TOPICS, map_messages, pose_message
+from calibslam_backend.relocalisation import FOUND
 from calibslam_backend.transform import transform_from_text
 from calibslam_msgs_py.conversions import (
     RosTypes,
@@ -194,7 +195,12 @@ class BackendNode(Node):
                 response.success, response.message = False, str(error)
                 return response
         response.success = True
-        response.message = f"{len(known.quadrics)} objects; the robot must be where that map was begun"
+        start = (
+            "the camera is looked for by the objects it sees"
+            if self._estimator_settings.start_in_map == FOUND
+            else "the robot must be where that map was begun"
+        )
+        response.message = f"{len(known.quadrics)} objects; {start}"
         return response
 
     # -- worker's thread ----------------------------------------------------------------------------------------

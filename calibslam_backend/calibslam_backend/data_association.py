@@ -6,10 +6,10 @@ A track is open until it is bound to a quadric, which happens when several keyfr
 
 from __future__ import annotations
 
-import math
+import functools
 from collections import Counter
 from collections.abc import Iterable, Set
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -22,6 +22,7 @@ from calibslam_backend.association import (
     predict,
     predicted_corners,
     same_object,
+    unambiguous,
 )
 from calibslam_backend.box_measurement import BoxMeasurement, prepare
 from calibslam_backend.estimator_settings import EstimatorSettings
@@ -29,7 +30,7 @@ from calibslam_backend.graph import ObjectGraph, UpdateReport
 from calibslam_backend.initialisation import initialise
 from calibslam_backend.localisation import localise
 from calibslam_backend.noise import NoiseModel
-from calibslam_backend.relocalisation import relocalise
+from calibslam_backend.relocalisation import Relocalised, relocalise
 from calibslam_backend.revision import revise
 from calibslam_backend.tracking import overlap
 from calibslam_msgs_py.measurements import Array, Boxes, Camera
@@ -52,6 +53,11 @@ class Frame:
     classes: tuple[str, ...]
     names: tuple[str, ...]
     quadrics: list[int | None]
+
+    @functools.cached_property
+    def arrays(self) -> list[Array]:
+        """(N, ...) corners, whiteners, bounds and clip of the boxes."""
+        return [np.stack([getattr(b, name) for b in self.boxes]) for name in ("corners", "whitener", "bounds", "clip")]
 
 
 @dataclass
@@ -177,8 +183,29 @@ class DataAssociation:
                 predictions.append(Prediction(j, *prediction, self.class_of_quadric(j)))
         classes = [self._candidates[frame.tracks[n]].classes.most_common(1)[0][0] for n in rows]
         cost = distances(predictions, open_boxes, classes, self.settings)
-        for p, r in assign(cost):
+        for p, r in unambiguous(cost, assign(cost), self.settings.ambiguity):
             self._vote_for(frame.tracks[rows[r]], predictions[p].landmark)
+
+    def find(self, frame: Frame) -> Relocalised | None:
+        """Where in a loaded map a camera with these boxes is."""
+        known = list(self._graph.landmarks)
+        classes = np.array([self.class_of_quadric(j) for j in known])
+        found = relocalise(
+            None,
+            frame.boxes,
+            np.stack([self._graph.quadric(j) for j in known]),
+            np.reshape([classes == self._class_of(track) for track in frame.tracks], (-1, len(known))),
+            self.camera.K,
+            (self.camera.width, self.camera.height),
+            self.settings.robust_scale,
+            self.settings,
+        )
+        return found and replace(found, pairs=[(n, known[m]) for n, m in found.pairs])
+
+    def bind_found(self, frame: Frame, found: Relocalised) -> None:
+        """The boxes of the keyframe where the camera was found belong to the quadrics that it was found by."""
+        for n, j in found.pairs:
+            self._bind(frame.tracks[n], j)
 
     def _vote_for(self, track: int, landmark: int) -> None:
         decided = self._votes.add(track, landmark)
@@ -249,19 +276,16 @@ class DataAssociation:
         """The quadric that this one is, if the map has it."""
         if self.settings.association == GIVEN:
             return None
-        best: int | None = None
-        nearest = np.inf
-        for j in self._graph.landmarks:
-            other = self._graph.quadric(j)
-            distance = math.dist(other[:3], vector[:3])
-            if (
-                distance < nearest
-                and same_object(vector, other, self.settings.merge_distance)
-                and self.classes[j].keys() & candidate.classes.keys()
-                and not self._seen_apart(candidate, j)
-            ):
-                best, nearest = j, distance
-        return best
+        ids = list(self._graph.landmarks)
+        if not ids:
+            return None
+        vectors = np.stack([self._graph.quadric(j) for j in ids])
+        same = same_object(vector, vectors, self.settings.merge_distance)
+        for n in np.argsort(np.linalg.norm(vectors[:, :3] - vector[:3], axis=1)):
+            j = ids[n]
+            if same[n] and self.classes[j].keys() & candidate.classes.keys() and not self._seen_apart(candidate, j):
+                return j
+        return None
 
     def revise(self, number: int | None = None) -> int:
         """Judge anew whose the boxes of earlier keyframes are; returns how many changed hands.
@@ -295,13 +319,15 @@ class DataAssociation:
 
     def _revise_frame(self, k: int, ids: list[int], quadrics: Array) -> int:
         frame = self.frames[k]
+        if not frame.boxes:
+            return 0
         by_track = [
             Counter(j for i, m in self._candidates[t].seen if (j := self.frames[i].quadrics[m]) is not None)
             for t in frame.tracks
         ]
         revised = revise(
             self._graph.pose(k),
-            frame.boxes,
+            frame.arrays,
             frame.classes,
             by_track,
             quadrics,
@@ -340,26 +366,20 @@ class DataAssociation:
                 self._unite(j, known)
                 gone.append(j)
         self._same.clear()
-        for j in sorted(self._graph.landmarks, reverse=True):
-            target = self._older_twin(j)
-            if target is not None:
-                self._unite(j, target)
-                gone.append(j)
+        ids = sorted(self._graph.landmarks)
+        if not ids:
+            return gone
+        vectors = np.stack([self._graph.quadric(j) for j in ids])
+        for m in reversed(range(len(ids))):
+            # An older quadric of its place, size and class, never seen beside it, is the same object.
+            for n in np.flatnonzero(same_object(vectors[m], vectors[:m], self.settings.merge_distance)):
+                j, older = ids[m], ids[n]
+                boxes, others = (self._graph.landmarks[i].boxes.keys() for i in (j, older))
+                if self.class_of_quadric(older) == self.class_of_quadric(j) and not _apart(boxes, others):
+                    self._unite(j, older)
+                    gone.append(j)
+                    break
         return gone
-
-    def _older_twin(self, j: int) -> int | None:
-        """An older quadric that is the same object: of its place, size and class, and never seen beside it."""
-        vector, frames = self._graph.quadric(j), self._graph.landmarks[j].boxes.keys()
-        for i in sorted(self._graph.landmarks):
-            if i >= j:
-                break
-            if (
-                same_object(vector, self._graph.quadric(i), self.settings.merge_distance)
-                and self.class_of_quadric(i) == self.class_of_quadric(j)
-                and not _apart(frames, self._graph.landmarks[i].boxes.keys())
-            ):
-                return i
-        return None
 
     def note(self, report: UpdateReport) -> None:
         """Book what the graph took out: its boxes and tracks are open again."""

@@ -17,8 +17,8 @@ from bisect import insort
 from collections import Counter
 from dataclasses import dataclass
 
+import gtsam
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from calibslam_backend.association import GIVEN
 from calibslam_backend.box_measurement import undistorted
@@ -29,6 +29,7 @@ from calibslam_backend.kernels import load_kernels
 from calibslam_backend.object_map import ObjectMap
 from calibslam_backend.odometry import MotionChain
 from calibslam_backend.quadric import Ellipsoid, covariance_of_pose_and_radii, covariance_of_vector
+from calibslam_backend.relocalisation import FOUND, Relocalised
 from calibslam_backend.tracking import Tracker, unique
 from calibslam_msgs_py.measurements import (
     SECOND,
@@ -68,6 +69,8 @@ class Keyframe:
 class Estimator:
     """Incremental object SLAM of one camera."""
 
+    SIGHTINGS_APART = SECOND // 5
+    SIGHTINGS_AGREE = 0.2  # [rad, m]
     ROUNDS = 5  # of association and optimisation at the end
 
     def __init__(self, camera: Camera, T_body_camera: Array, settings: EstimatorSettings) -> None:
@@ -85,6 +88,8 @@ class Estimator:
         self._tracker = Tracker(self.settings, self.camera.K)
         self._graph = ObjectGraph(self.camera.K, self.settings, self.settings, self.settings)
         self._objects = DataAssociation(self._graph, self.camera, self.settings, self.counts)
+        self._searching = False
+        self._sighting: tuple[int, Array] | None = None  # where a camera that searches was seen last
         self._given: dict[str, int] = {}
         self._waiting: list[tuple[int, int, Boxes]] = []
         self._last_frame: int | None = None
@@ -103,8 +108,9 @@ class Estimator:
         Raises:
             InvalidMeasurement: see `MotionChain.add`; nothing is changed.
         """
-        if not self._motions.add(motion):
-            self.counts["odometry_gap"] += 1
+        problem = self._motions.add(motion)
+        if problem:
+            self.counts[problem] += 1
         self.counts["motions"] += 1
         return self._process()
 
@@ -217,7 +223,10 @@ class Estimator:
         return self.pose(len(self.stamps) - 1) @ np.linalg.inv(self._T_body_camera)
 
     def load(self, known: ObjectMap) -> None:
-        """Forget everything and start in a known map, from the pose where that map was begun.
+        """Forget everything and start in a known map.
+
+        By setting the camera is then where that map was begun, or it is found by the objects it sees: nothing is
+        estimated until two images, at least `SIGHTINGS_APART` apart, agree on where it is.
 
         Raises:
             ValueError: a quadric has no covariance.
@@ -226,6 +235,7 @@ class Estimator:
             if not np.isfinite(quadric.covariance).all():
                 raise ValueError(f"quadric {quadric.id} of the map has no covariance")
         self.reset()
+        self._searching = bool(known.quadrics) and self.settings.start_in_map == FOUND
         for quadric in known.quadrics:
             vector = Ellipsoid(quadric.T_map_object, quadric.radii).vector()
             covariance = covariance_of_vector(quadric.T_map_object, quadric.radii, quadric.covariance)
@@ -263,13 +273,20 @@ class Estimator:
             turned = self._motions.between(self._last_frame, boxes.stamp)[0][:3, :3].T
         self._last_frame = boxes.stamp
         boxes, tracks = self._tracks(boxes, turned)
-        motion = None
+        motion = found = None
+        if self._searching:
+            found = self._find(boxes, tracks)
+            if found is None:
+                self.counts["images_not_found"] += 1
+                return None
         if self.stamps:
             interval = self.stamps[-1], boxes.stamp
-            motion = Motion(*self._motions.between(*interval), self._motions.drifts(*interval))
+            motion = Motion(
+                *self._motions.between(*interval), self._motions.drifts(*interval), self._motions.measured(*interval)
+            )
             if not self._moved(motion.T, boxes.stamp - self.stamps[-1]):
                 return None
-        return self._keyframe(boxes, tracks, motion, began)
+        return self._keyframe(boxes, tracks, motion, found, began)
 
     def _tracks(self, boxes: Boxes, R_now_before: Array) -> tuple[Boxes, list[int]]:
         """The boxes that belong to a track, and the number of that track."""
@@ -290,25 +307,49 @@ class Estimator:
 
     def _moved(self, motion: Array, duration: int) -> bool:
         s = self.settings
-        rotation = float(np.linalg.norm(Rotation.from_matrix(motion[:3, :3]).as_rotvec()))
+        rotation = float(np.linalg.norm(gtsam.Rot3.Logmap(gtsam.Rot3(motion[:3, :3]))))
         translation = float(np.linalg.norm(motion[:3, 3]))
         return (
             rotation / max(s.keyframe_rotation, 1e-9) + translation / max(s.keyframe_translation, 1e-9) >= 1.0
             or duration >= s.keyframe_interval * SECOND
         )
 
-    def _keyframe(self, boxes: Boxes, tracks: list[int], motion: Motion | None, began: float) -> Keyframe:
+    def _find(self, boxes: Boxes, tracks: list[int]) -> Relocalised | None:
+        """Where in the known map the camera is, once two images agree on it."""
+        found, before = self._objects.find(self._objects.frame(boxes, tracks)), self._sighting
+        if found is None:
+            return None
+        if before is not None and boxes.stamp - before[0] < self.SIGHTINGS_APART:
+            return None
+        self._sighting = boxes.stamp, found.T_map_camera
+        motion = np.eye(4)
+        if before is not None:
+            motion, _ = self._motions.between(before[0], boxes.stamp)
+        self._motions.forget_before(boxes.stamp)
+        if before is None:
+            return None
+        difference = gtsam.Pose3(before[1] @ motion).localCoordinates(gtsam.Pose3(found.T_map_camera))
+        if np.abs(difference).max() > self.SIGHTINGS_AGREE:
+            return None
+        self._searching = False
+        return found
+
+    def _keyframe(
+        self, boxes: Boxes, tracks: list[int], motion: Motion | None, found: Relocalised | None, began: float
+    ) -> Keyframe:
         objects = self._objects
         frame = objects.frame(boxes, tracks)
         k = len(self.stamps)
         if motion is None:
-            self._graph.add_origin()
+            self._graph.add_origin(None if found is None else found.T_map_camera)
         else:
             guess = objects.localise(frame, self._graph.predict(motion), motion.covariance)
             self._graph.add_pose(motion, guess)
         self.stamps.append(boxes.stamp)
         self._motions.forget_before(boxes.stamp)
         used = objects.add(frame)
+        if found is not None:
+            objects.bind_found(frame, found)
         if motion is not None:
             objects.vote(k, motion.covariance)
             objects.relocalise(k)

@@ -50,11 +50,19 @@ class GraphSettings(Settings):
 
 @dataclass(frozen=True)
 class Motion:
-    """Between consecutive poses: (4, 4) as measured, its covariance (6, 6), and the time [s] during which it drifts."""
+    """Between consecutive poses.
+
+    Attributes:
+        T: (4, 4), failures of odometry bridged.
+        covariance: (6, 6) of it.
+        drifts: time [s] during which it drifts.
+        measured: (4, 4) as odometry said.
+    """
 
     T: Array
     covariance: Array
     drifts: float
+    measured: Array
 
 
 @dataclass
@@ -80,6 +88,7 @@ class ObjectGraph:
     LARGEST_RADIUS, LARGEST_DISTANCE, SMALLEST_RADIUS = 10.0, 200.0, 1e-4
     LARGEST_STEP = 0.5  # [rad, m] of a pose in one update; more is checked by a damped optimisation
     REPAIR_ITERATIONS = 15
+    FOUND_SIGMA = 0.5  # [rad, m] of a pose found in a known map: its boxes say it better
 
     def __init__(self, K: Array, settings: GraphSettings, priors: InitialisationSettings, noise: MotionNoise) -> None:
         self._K = np.ascontiguousarray(K, float)
@@ -90,7 +99,7 @@ class ObjectGraph:
         self._has_origin = False
         self._motions: list[Motion] = []
         self.landmarks: dict[int, Landmark] = {}
-        self._origin = gtsam.Pose3(T_MAP_FIRST_CAMERA)
+        self._origin, self._origin_sigma = T_MAP_FIRST_CAMERA, settings.prior_sigma
         # The factors are linear in the drift: there is nothing to relinearise.
         pose, quadric = settings.relinearise_pose, settings.relinearise_quadric
         self._smoother = Smoother({"x": (6, pose), "q": (9, quadric), "d": (DRIFT, np.inf)})
@@ -109,12 +118,12 @@ class ObjectGraph:
 
     def poses(self) -> Array:
         """(N, 4, 4) of all keyframes."""
-        return np.stack([self.pose(k) for k in range(self.size)]) if self.size else np.empty((0, 4, 4))
+        return _poses(self._smoother.values)
 
     def odometry(self) -> tuple[Array, Array]:
         """What odometry alone says: poses (N, 4, 4) and their covariances (N, 6, 6), from the same origin."""
-        steps = [(motion.T, motion.covariance) for motion in self._motions]
-        return dead_reckoning(self._origin.matrix(), np.eye(6) * self._settings.prior_sigma**2, steps)
+        steps = [(motion.measured, motion.covariance) for motion in self._motions]
+        return dead_reckoning(self._origin, np.eye(6) * self._origin_sigma**2, steps)
 
     def drift(self) -> Array:
         """(6,) velocity [rad/s, m/s] that odometry misses; zero while nothing is known of it."""
@@ -154,12 +163,15 @@ class ObjectGraph:
 
     # -- changes, which take effect with the next update --------------------------------------------------------
 
-    def add_origin(self) -> None:
-        """The first pose."""
+    def add_origin(self, found: Array | None = None) -> None:
+        """The first pose: the origin of the map, or (4, 4) T_map_camera as found in a known map."""
         self._has_origin = True
-        noise = gtsam.noiseModel.Isotropic.Sigma(6, self._settings.prior_sigma)
-        self._smoother.insert(_x(0), self._origin)
-        self._smoother.add("origin", gtsam.PriorFactorPose3(_x(0), self._origin, noise))
+        if found is not None:
+            self._origin, self._origin_sigma = found, self.FOUND_SIGMA
+        origin = gtsam.Pose3(self._origin)
+        noise = gtsam.noiseModel.Isotropic.Sigma(6, self._origin_sigma)
+        self._smoother.insert(_x(0), origin)
+        self._smoother.add("origin", gtsam.PriorFactorPose3(_x(0), origin, noise))
 
     def add_pose(self, motion: Motion, guess: Array) -> int:
         """The next pose, after a motion from the last one; returns its number.
@@ -261,12 +273,11 @@ class ObjectGraph:
 
     def _jumped(self, before: gtsam.Values) -> bool:
         """Whether a pose moved farther than an undamped step can be trusted with."""
-        now = self._smoother.values
-        for k in range(self.size):
-            step = gtsam.Pose3.Logmap(before.atPose3(_x(k)).between(now.atPose3(_x(k))))
-            if not np.isfinite(step).all() or np.abs(step).max() > self.LARGEST_STEP:
-                return True
-        return False
+        old, new = _poses(before), _poses(self._smoother.values)
+        moved = np.linalg.norm(new[:, :3, 3] - old[:, :3, 3], axis=1)
+        # The norm of the difference of two rotations is 2 sqrt(2) sin(angle / 2).
+        turned = np.linalg.norm(new[:, :3, :3] - old[:, :3, :3], axis=(1, 2)) / np.sqrt(2.0)
+        return not bool((moved < self.LARGEST_STEP).all() and (turned < self.LARGEST_STEP).all())
 
     def _repair(self, before: gtsam.Values) -> None:
         """Optimise the whole graph with damping from an estimate that was good, and build the tree anew.
@@ -285,6 +296,15 @@ class ObjectGraph:
                 log.warning("%s; giving up quadric %d", _first_sentence(error), youngest)
                 self.remove_quadric(youngest)
                 before.erase(_q(youngest))
+
+
+def _poses(values: gtsam.Values) -> Array:
+    """(N, 4, 4) of all poses, in their order."""
+    rows = gtsam.utilities.extractPose3(values)  # rotation by rows, translation
+    poses = np.tile(np.eye(4), (len(rows), 1, 1))
+    poses[:, :3, :3] = rows[:, :9].reshape(-1, 3, 3)
+    poses[:, :3, 3] = rows[:, 9:]
+    return poses
 
 
 def _x(k: int) -> int:

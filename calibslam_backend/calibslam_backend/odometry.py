@@ -17,6 +17,9 @@ import numpy as np
 from calibslam_msgs_py.measurements import SECOND, Array, InvalidMeasurement, RelativeMotion
 from calibslam_msgs_py.settings import Settings, setting
 
+SHORTEST = 0.03  # [s]: in shorter motions, noise looks like acceleration
+EXPLAINED = 3.0  # standard deviations
+
 
 @dataclass(frozen=True)
 class MotionNoise(Settings):
@@ -31,6 +34,29 @@ class MotionNoise(Settings):
     drift_translation: float = setting(
         0.003, "unknown odometry noise: constant drift in translation", unit="m/s", low=1e-9
     )
+
+    max_acceleration: float = setting(
+        30.0, "change of velocity from one motion to the next that a body can do: 3 g", unit="m/s^2", low=0.1
+    )
+    max_angular_acceleration: float = setting(
+        100.0, "change of angular velocity from one motion to the next that a body can do", unit="rad/s^2", low=0.1
+    )
+
+    def is_plausible(self, velocity: Array, before: Array, seconds: float, covariance: Array | None) -> bool:
+        """Whether a body can have these two velocities (6,) [rad/s, m/s] in consecutive motions.
+
+        Args:
+            velocity, before: in the body.
+            seconds: duration of the later one.
+            covariance: (6, 6) of the later motion, if known: what it explains is plausible as well.
+        """
+        seconds = max(seconds, SHORTEST)
+        noise = np.zeros(6) if covariance is None else EXPLAINED * np.sqrt(2.0 * np.diag(covariance)) / seconds
+        change = velocity - before
+        return bool(
+            np.linalg.norm(change[:3]) < self.max_angular_acceleration * seconds + np.linalg.norm(noise[:3])
+            and np.linalg.norm(change[3:]) < self.max_acceleration * seconds + np.linalg.norm(noise[3:])
+        )
 
     def covariance(self, T_start_end: Array) -> Array:
         """(6, 6) [rotation, translation] for a motion (4, 4)."""
@@ -102,9 +128,12 @@ class MotionChain:
     """Consecutive relative motions of the camera, readable between any two times.
 
     Times inside a step are interpolated along the geodesic, its covariance in proportion.
+
+    A step that no body can make, by its change of velocity both from the last possible step and from the one just
+    before, is a failure of odometry: the body is then taken to go on as it did, and to do unseen what it may.
     """
 
-    # What a body may do unseen while odometry is missing: 1 rad/s and 1 m/s.
+    # What a body may do unseen, while odometry is missing or fails: 1 rad/s and 1 m/s more or less.
     UNSEEN_MOTION = 1.0
 
     def __init__(self, noise: MotionNoise, T_body_camera: Array) -> None:
@@ -112,7 +141,10 @@ class MotionChain:
         self._extrinsic = gtsam.Pose3(T_body_camera)
         self._times: list[int] = []  # ends of steps; the first is the start of the chain
         self._poses: list[gtsam.Pose3] = []  # camera in the chain's own frame, at those times
+        self._measured: list[gtsam.Pose3] = []  # the same, nothing bridged
         self._covariances: list[Array | None] = []  # of the step that ends there
+        self._unseen: list[float] = []  # what the body may have done unseen in that step [rad and m]
+        self._velocities: list[Array] = []  # of the last possible step and of the last one, possible or not
 
     @property
     def start(self) -> int | None:
@@ -124,8 +156,10 @@ class MotionChain:
         """Last time it knows [ns]."""
         return self._times[-1] if self._times else None
 
-    def add(self, motion: RelativeMotion) -> bool:
-        """Append a motion of the body; False if odometry was missing before it and a gap was bridged.
+    def add(self, motion: RelativeMotion) -> str:
+        """Append a motion of the body.
+
+        Returns what was wrong and is bridged: "odometry_gap", "odometry_implausible", or "".
 
         Raises:
             InvalidMeasurement: "not_finite", "covariance", "time_backwards" or "overlap".
@@ -141,45 +175,65 @@ class MotionChain:
             to_camera = self._extrinsic.inverse().AdjointMap()
             covariance = to_camera @ covariance @ to_camera.T
         if not self._times:
-            self._append(motion.start, gtsam.Pose3(), None)
+            self._append(motion.start, gtsam.Pose3(), gtsam.Pose3(), None, 0.0)
         last = self._times[-1]
         if motion.start < last:
             raise InvalidMeasurement(
                 "overlap",
                 f"motion from {motion.start} to {motion.end} ns starts before {last} ns, the last one's end",
             )
-        contiguous = motion.start == last
-        if not contiguous:
-            unseen = np.eye(6) * (self.UNSEEN_MOTION * (motion.start - last) / SECOND) ** 2
-            self._append(motion.start, self._poses[-1], unseen)
+        problem = ""
+        if motion.start > last:
+            problem = "odometry_gap"
+            unseen = self.UNSEEN_MOTION * (motion.start - last) / SECOND
+            self._append(motion.start, gtsam.Pose3(), gtsam.Pose3(), np.zeros((6, 6)), unseen)
+            self._velocities.clear()
+        seconds = (motion.end - motion.start) / SECOND
         step = self._extrinsic.inverse() * gtsam.Pose3(motion.T_start_end) * self._extrinsic
-        self._append(motion.end, self._poses[-1] * step, covariance)
-        return contiguous
+        velocity = gtsam.Pose3.Logmap(step) / seconds
+        near = [self._noise.is_plausible(velocity, before, seconds, covariance) for before in self._velocities]
+        if any(near) or not near:
+            self._velocities = [velocity, velocity]
+            self._append(motion.end, step, step, covariance, 0.0)
+            return problem
+        self._velocities[1] = velocity
+        coasting = gtsam.Pose3.Expmap(self._velocities[0] * seconds)
+        self._append(motion.end, coasting, step, covariance, self.UNSEEN_MOTION * seconds)
+        return "odometry_implausible"
 
     def between(self, start: int, end: int) -> tuple[Array, Array]:
         """Motion (4, 4) of the camera and its covariance (6, 6) [rotation, translation] from start to end [ns].
 
         Both times must lie inside the chain.
         """
-        first, last = self._pose_at(start), self._pose_at(end)
+        first, last = self._pose_at(start, self._poses), self._pose_at(end, self._poses)
         motion = first.between(last)
-        covariance = np.zeros((6, 6))
+        covariance, unseen, unknown = np.zeros((6, 6)), 0.0, False
         for i in range(bisect_right(self._times, start), len(self._times)):
             begin, finish = max(start, self._times[i - 1]), min(end, self._times[i])
             if begin >= end:
                 break
+            share = (finish - begin) / (self._times[i] - self._times[i - 1])
+            unseen += share * self._unseen[i]  # of one wrong velocity, hence not in squares
             known = self._covariances[i]
             if known is None:
-                return motion.matrix(), self._noise.covariance(motion.matrix())
-            share = (finish - begin) / (self._times[i] - self._times[i - 1])
-            to_end = last.inverse().compose(self._pose_at(finish)).AdjointMap()
-            covariance += to_end @ (share * known) @ to_end.T
-        return motion.matrix(), covariance
+                unknown = True
+            else:
+                to_end = last.inverse().compose(self._pose_at(finish, self._poses)).AdjointMap()
+                covariance += to_end @ (share * known) @ to_end.T
+        if unknown:
+            covariance = self._noise.covariance(motion.matrix())
+        return motion.matrix(), covariance + unseen**2 * np.eye(6)
 
     def forget_before(self, time: int) -> None:
         """Drop what is not needed to read times from `time` [ns] on."""
         keep = max(bisect_right(self._times, time) - 1, 0)
-        del self._times[:keep], self._poses[:keep], self._covariances[:keep]
+        del self._times[:keep], self._poses[:keep], self._measured[:keep]
+        del self._covariances[:keep], self._unseen[:keep]
+
+    def measured(self, start: int, end: int) -> Array:
+        """Motion (4, 4) of the camera from start to end [ns] as odometry said, possible or not."""
+        return np.asarray(self._pose_at(start, self._measured).between(self._pose_at(end, self._measured)).matrix())
 
     def drifts(self, start: int, end: int) -> float:
         """How long [s] the motion from start to end [ns] drifts: all the time if its covariance is not known."""
@@ -187,19 +241,19 @@ class MotionChain:
         unknown = any(self._covariances[i] is None for i in steps if i < len(self._times))
         return (end - start) / SECOND if unknown else 0.0
 
-    def clear(self) -> None:
-        """Forget everything."""
-        del self._times[:], self._poses[:], self._covariances[:]
-
-    def _append(self, time: int, pose: gtsam.Pose3, covariance: Array | None) -> None:
+    def _append(
+        self, time: int, step: gtsam.Pose3, measured: gtsam.Pose3, covariance: Array | None, unseen: float
+    ) -> None:
         self._times.append(time)
-        self._poses.append(pose)
+        self._poses.append(self._poses[-1] * step if self._poses else step)
+        self._measured.append(self._measured[-1] * measured if self._measured else measured)
         self._covariances.append(covariance)
+        self._unseen.append(unseen)
 
-    def _pose_at(self, time: int) -> gtsam.Pose3:
+    def _pose_at(self, time: int, poses: list[gtsam.Pose3]) -> gtsam.Pose3:
         i = bisect_right(self._times, time) - 1
         if i == len(self._times) - 1:
-            return self._poses[i]
+            return poses[i]
         share = (time - self._times[i]) / (self._times[i + 1] - self._times[i])
-        step = gtsam.Pose3.Logmap(self._poses[i].between(self._poses[i + 1]))
-        return self._poses[i].compose(gtsam.Pose3.Expmap(share * step))
+        step = gtsam.Pose3.Logmap(poses[i].between(poses[i + 1]))
+        return poses[i].compose(gtsam.Pose3.Expmap(share * step))

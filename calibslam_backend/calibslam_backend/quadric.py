@@ -57,9 +57,9 @@ class Ellipsoid:
         return np.concatenate([self.T_world_object[:3, 3], vector_from_matrix(L)])
 
 
-def mean_radius(vector: Array) -> float:
-    """Geometric mean of the semi-axes of a quadric (9,) [m]: a third of the trace of L is its logarithm."""
-    return math.exp((vector[3] + vector[4] + vector[5]) / 3.0)
+def mean_radius(vectors: Array) -> Array:
+    """Geometric mean of the semi-axes (...) [m] of quadrics (..., 9): a third of the trace of L is its logarithm."""
+    return np.asarray(np.exp(vectors[..., 3:6].sum(axis=-1) / 3.0))
 
 
 def vector_from_matrix(L: Array) -> Array:

@@ -8,6 +8,7 @@ odometry predicts.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import combinations
@@ -22,9 +23,16 @@ from calibslam_backend.quadric import mean_radius, shapes
 from calibslam_msgs_py.measurements import Array
 from calibslam_msgs_py.settings import Settings, setting
 
+FOUND, BEGIN = "found", "begin"
+
 
 @dataclass(frozen=True)
 class RelocalisationSettings(Settings):
+    start_in_map: str = setting(
+        FOUND,
+        "first pose in a loaded map: found by its objects, or where that map was begun",
+        choices=(FOUND, BEGIN),
+    )
     relocalisation_boxes: int = setting(4, "boxes a new pose must explain", low=3)
     relocalisation_gain: int = setting(2, "boxes it must explain more than odometry's pose", low=1)
     relocalisation_overlap: float = setting(
@@ -41,13 +49,14 @@ class Relocalised:
 
 
 REFINED = 4  # best hypotheses that are refined
+FOUND_SHARE = 0.6  # of the boxes that a pose must explain of which nothing is known
 TRIPLES = 300  # hypotheses of three pairs at most
 LENGTH_ERROR = 0.3  # by which distances between objects, guessed from their sizes, may be wrong
 PROMISING = 3  # pairs that a hypothesis must explain to be refined
 
 
 def relocalise(
-    predicted: Array,
+    predicted: Array | None,
     boxes: Sequence[BoxMeasurement],
     quadrics: Array,
     compatible: NDArray[np.bool_],
@@ -59,7 +68,7 @@ def relocalise(
     """A better pose than the predicted one, or None.
 
     Args:
-        predicted: (4, 4) T_map_camera by odometry.
+        predicted: (4, 4) T_map_camera by odometry; None: nothing is known of it.
         boxes: N of one image.
         quadrics: (M, 9) vectors.
         compatible: (N, M) whether a box may be of a quadric, by their classes.
@@ -71,7 +80,7 @@ def relocalise(
     if len(boxes) < settings.relocalisation_boxes or np.count_nonzero(compatible) < settings.relocalisation_boxes:
         return None
     corners = np.stack([box.corners for box in boxes])
-    surfaces, sizes = shapes(quadrics), np.array([mean_radius(vector) for vector in quadrics])
+    surfaces, sizes = shapes(quadrics), mean_radius(quadrics)
     size, centres = np.array(image, dtype=np.float64), np.ascontiguousarray(quadrics[:, :3])
 
     def overlaps(T: Array) -> Array:
@@ -84,12 +93,15 @@ def relocalise(
     def score(T: Array) -> float:
         return float(overlaps(T).max(axis=1).sum())
 
-    needed = max(settings.relocalisation_boxes, len(explained(predicted)) + settings.relocalisation_gain)
+    needed = max(settings.relocalisation_boxes, math.ceil(FOUND_SHARE * len(boxes)))
+    if predicted is not None:
+        needed = max(settings.relocalisation_boxes, len(explained(predicted)) + settings.relocalisation_gain)
     if len(boxes) < needed:
         return None
     points = _points(corners, sizes, K)
     best: Relocalised | None = None
-    for hypotheses in (_by_one(predicted, points, quadrics, compatible), _by_three(points, quadrics, compatible)):
+    near = [] if predicted is None else _by_one(predicted, points, quadrics, compatible)
+    for hypotheses in (near, _by_three(points, quadrics, compatible)):
         for T in sorted(hypotheses, key=score, reverse=True)[:REFINED]:
             pairs = explained(T)
             for _ in range(2):  # better poses explain more boxes, which make better poses

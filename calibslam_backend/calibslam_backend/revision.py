@@ -14,10 +14,8 @@ from collections.abc import Sequence
 
 import numba
 import numpy as np
-from scipy.stats import chi2
 
-from calibslam_backend.association import AssociationSettings, assign, class_cost
-from calibslam_backend.box_measurement import BoxMeasurement
+from calibslam_backend.association import AssociationSettings, assign, class_cost, gate_of
 from calibslam_backend.quadric import box_of_visible_part, shapes
 from calibslam_backend.relocalisation import overlaps_at
 from calibslam_msgs_py.measurements import Array
@@ -27,7 +25,7 @@ COHERENCE = 10.0  # bonus of a pair if all boxes of the track go to that quadric
 
 def revise(
     T_map_camera: Array,
-    boxes: Sequence[BoxMeasurement],
+    boxes: Sequence[Array],
     classes: Sequence[str],
     by_track: Sequence[Counter[int]],
     quadrics: Array,
@@ -41,7 +39,7 @@ def revise(
 
     Args:
         T_map_camera: (4, 4) of the keyframe.
-        boxes: N.
+        boxes: corners (N, 4), whiteners (N, 4, 4), bounds (N, 4) and clip (N, 4) of N boxes.
         classes: N, that they carry.
         by_track: N; to which quadrics the boxes of the same track are given at present, how often.
         quadrics: (M, 9) vectors.
@@ -51,20 +49,17 @@ def revise(
         image: width and height [px].
         settings: gate, model error, share of wrong classes.
     """
-    if not boxes or not len(ids):
-        return [None] * len(boxes)
-    arrays = [np.stack([getattr(box, name) for box in boxes]) for name in ("corners", "whitener", "bounds", "clip")]
     cost = squared_distances(
-        np.ascontiguousarray(T_map_camera), quadrics, K, np.array(image, float), *arrays, settings.model_error
+        np.ascontiguousarray(T_map_camera), quadrics, K, np.array(image, float), *boxes, settings.model_error
     )
-    gate = chi2.ppf(settings.gate, 4)
+    gate = gate_of(settings.gate)
     for n, (class_id, track) in enumerate(zip(classes, by_track, strict=True)):
         for m in np.flatnonzero(np.isfinite(cost[:, n])).tolist():
             cost[m, n] += class_cost(classes_of[m], class_id, settings.wrong_class)
             if track:
                 cost[m, n] -= COHERENCE * (track[ids[m]] / track.total() - 0.5)
     cost[cost >= gate] = np.inf
-    result: list[int | None] = [None] * len(boxes)
+    result: list[int | None] = [None] * len(classes)
     for row, column in assign(cost - gate):
         result[column] = ids[row]
     return result

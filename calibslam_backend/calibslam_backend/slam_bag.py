@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from calibslam_backend.estimator import Estimator, EstimatorSettings, Keyframe
+from calibslam_backend.object_map import ObjectMap
 from calibslam_backend.published import POSE, map_messages, pose_message
 from calibslam_backend.recording import Recording
 from calibslam_backend.run_folder import RunRecord, write_run
@@ -31,6 +32,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("bag", help="rosbag2 folder or .mcap file with boxes, odometry and camera_info")
     parser.add_argument("--out", required=True, type=Path, metavar="RUN", help="folder for the result")
     parser.add_argument("--calibrator", metavar="FILE", help="model for boxes without covariance")
+    parser.add_argument("--map", type=Path, metavar="FILE", help="map.json to go on with")
     parser.add_argument("--batch", action="store_true", help="optimise the whole graph once more at the end")
     parser.add_argument(
         "--camera-in-body",
@@ -43,15 +45,21 @@ def main(arguments: Sequence[str] | None = None) -> int:
     logging.basicConfig(level=logging.WARNING, format="%(levelname)s: %(message)s")
     try:
         settings = from_arguments(parsed, EstimatorSettings)
-        metrics = slam_bag(parsed.bag, parsed.out, settings, parsed.calibrator, parsed.batch, parsed.camera_in_body)
+        metrics = slam_bag(
+            parsed.bag, parsed.out, settings, parsed.calibrator, parsed.batch, parsed.camera_in_body, parsed.map
+        )
     except (BagError, SettingsError, ValueError, OSError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 1
     if not metrics["keyframes"]:
-        print(
-            f"error: {parsed.bag}: no image lies within the time of the odometry: do their clocks agree?",
-            file=sys.stderr,
+        lost = "images_not_found" in str(metrics["rejected"])
+        why = (
+            f"the camera was not found in {parsed.map}: does it show objects of that map? If it starts where that map "
+            "was begun, say --start-in-map begin"
+            if lost
+            else "no image lies within the time of the odometry: do their clocks agree?"
         )
+        print(f"error: {parsed.bag}: {why}", file=sys.stderr)
         return 1
     _summary(parsed.out, metrics)
     return 0
@@ -64,10 +72,13 @@ def slam_bag(
     calibrator: str | None = None,
     batch: bool = False,
     camera_in_body: str = "0 0 0 0 0 0 1",
+    known: Path | None = None,
 ) -> dict[str, object]:
     """Run the estimator over a bag and write a RUN folder; returns its metrics."""
     recording = Recording.open(bag, calibrator)
     estimator = Estimator(recording.camera, transform_from_text(camera_in_body), settings)
+    if known is not None:
+        estimator.load(ObjectMap.load(known))
     out.mkdir(parents=True, exist_ok=True)
     began = time.perf_counter()
     keyframes: list[Keyframe] = []

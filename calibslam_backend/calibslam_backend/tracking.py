@@ -28,17 +28,21 @@ class TrackingSettings(Settings):
 
 @dataclass
 class Track:
-    """One object over consecutive images: `corners` (4,) at `stamp` [ns], and how often it had which class."""
+    """One object over consecutive images: `corners` (4,) at `stamp` [ns], how often it had which class, and the class
+    it had most often."""
 
     id: int
     stamp: int
     corners: Array
+    class_id: str
     classes: Counter[str] = field(default_factory=Counter)
 
-    @property
-    def class_id(self) -> str:
-        """The class most of its boxes carry."""
-        return self.classes.most_common(1)[0][0]
+    def add(self, stamp: int, corners: Array, class_id: str) -> None:
+        """The box of the next image."""
+        self.stamp, self.corners = stamp, corners
+        self.classes[class_id] += 1
+        if self.classes[class_id] > self.classes[self.class_id]:
+            self.class_id = class_id
 
 
 def overlap(a: Array, b: Array) -> Array:
@@ -104,14 +108,14 @@ class Tracker:
             for t, b in zip(*linear_sum_assignment(-np.maximum(score, 0.0)), strict=True):
                 if score[t, b] > self._settings.track_overlap:
                     found[b] = self.tracks[t]
-        linked = [track or self._begin(stamp, box) for track, box in zip(found, corners, strict=True)]
+        measured = zip(corners, class_ids, strict=True)
+        linked = [track or self._begin(stamp, *box) for track, box in zip(found, measured, strict=True)]
         for track, box, class_id in zip(linked, corners, class_ids, strict=True):
-            track.stamp, track.corners = stamp, box
-            track.classes[class_id] += 1
+            track.add(stamp, box, class_id)
         return linked
 
-    def _begin(self, stamp: int, corners: Array) -> Track:
-        track = Track(self._next_id, stamp, corners)
+    def _begin(self, stamp: int, corners: Array, class_id: str) -> Track:
+        track = Track(self._next_id, stamp, corners, class_id)
         self._next_id += 1
         self.tracks.append(track)
         return track

@@ -21,6 +21,7 @@ from calibslam_backend.association import (
     distances,
     predict,
     same_object,
+    unambiguous,
 )
 from calibslam_backend.box_measurement import BoxMeasurement
 from calibslam_backend.quadric import ALL_EDGES, Ellipsoid, box_of_visible_part, image_bounds
@@ -166,7 +167,13 @@ def test_same_objects_are_near_and_alike() -> None:
         return Ellipsoid(T, np.full(3, radius)).vector()
 
     # The centres may be 0.7 of the two radii apart: 0.14 m.
-    assert same_object(at(0.0, 0.1), at(0.13, 0.1), 0.7)
-    assert not same_object(at(0.0, 0.1), at(0.15, 0.1), 0.7)
-    assert same_object(at(0.0, 0.1), at(0.0, 0.1 * SIZE_RATIO * 0.99), 0.7)
-    assert not same_object(at(0.0, 0.1), at(0.0, 0.1 * SIZE_RATIO * 1.01), 0.7)
+    others = [at(0.13, 0.1), at(0.15, 0.1), at(0.0, 0.1 * SIZE_RATIO * 0.99), at(0.0, 0.1 * SIZE_RATIO * 1.01)]
+    assert same_object(at(0.0, 0.1), np.stack(others), 0.7).tolist() == [True, False, True, False]
+
+
+def test_what_another_would_suit_nearly_as_well_is_not_decided() -> None:
+    cost = np.array([[1.0, 9.0, np.inf], [3.0, 2.0, 4.0]])
+    pairs = [(0, 0), (1, 1), (1, 2)]
+    assert unambiguous(cost, pairs, 2.5) == [(1, 1), (1, 2)]
+    assert unambiguous(cost, pairs, 2.0) == pairs
+    assert unambiguous(cost[:1], [(0, 0)], 9.0) == [(0, 0)]

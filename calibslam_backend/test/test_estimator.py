@@ -15,7 +15,7 @@ from small_world import CAMERA, SECOND, SmallWorld, around, objects
 from calibslam_backend import metrics
 from calibslam_backend.association import ESTIMATED, GIVEN
 from calibslam_backend.estimator import Estimator, EstimatorSettings, Keyframe
-from calibslam_backend.graph import ObjectGraph
+from calibslam_backend.graph import T_MAP_FIRST_CAMERA, ObjectGraph
 from calibslam_backend.noise import FIXED
 from calibslam_backend.object_map import ObjectMap, tum_lines
 from calibslam_backend.quadric import Ellipsoid
@@ -381,12 +381,13 @@ def test_reset_forgets_everything() -> None:
     np.testing.assert_array_equal(e.trajectory(), run(world, ESTIMATED).trajectory())
 
 
-def test_a_map_can_be_gone_on_with(tmp_path: Path) -> None:
+@pytest.mark.parametrize("start", ["begin", "found"])
+def test_a_map_can_be_gone_on_with(tmp_path: Path, start: str) -> None:
     """The objects of a saved map keep their ids and places, and their ids are not given again."""
     first = run(ONCE_AROUND, ESTIMATED)
     first.object_map().save(tmp_path / "map.json")
     known = ObjectMap.load(tmp_path / "map.json")
-    e = estimator(ESTIMATED)
+    e = estimator(ESTIMATED, start_in_map=start)
     e.load(known)
     assert e.objects == first.objects and e.stamps == []
     second = replace(ONCE_AROUND, seed=1)
@@ -400,6 +401,37 @@ def test_a_map_can_be_gone_on_with(tmp_path: Path) -> None:
         assert again[quadric.id].class_id == quadric.class_id
     assert e.objects <= first.objects + 2
     assert metrics.ate(estimated(e), second.truth()) < 0.03
+
+
+def test_a_camera_is_found_in_a_map_wherever_it_is() -> None:
+    """Begun at the other end of the arc: the trajectory is in the frame of the map, not in one of its own."""
+    known = run(ONCE_AROUND, ESTIMATED).object_map()
+    e = estimator(ESTIMATED)
+    e.load(known)
+    world = replace(ONCE_AROUND, poses=ONCE_AROUND.poses[::-1].copy(), seed=3)
+    feed(e, world.measurements())
+    e.finish()
+    assert e.counts["images_not_found"] < 12
+    T_map_world = T_MAP_FIRST_CAMERA @ np.linalg.inv(ONCE_AROUND.poses[0])
+    for stamp, T in zip(e.stamps, e.trajectory(), strict=True):
+        true = T_map_world @ world.poses[world.stamps.index(stamp)]
+        assert np.linalg.norm(T[:3, 3] - true[:3, 3]) < 0.1
+
+
+def test_a_camera_that_sees_nothing_of_the_map_is_not_found() -> None:
+    """Another room with the same classes: no keyframe, and every image is counted."""
+    known = run(ONCE_AROUND, ESTIMATED).object_map()
+    rng = np.random.default_rng(3)
+    others = []
+    for o in objects():
+        T = o.T_world_object.copy()
+        T[:3, 3] = rng.uniform([-0.8, -0.8, 0.0], [0.8, 0.8, 0.5])
+        others.append(Ellipsoid(T, rng.permutation(o.radii)))
+    e = estimator(ESTIMATED)
+    e.load(known)
+    world = replace(ONCE_AROUND, objects=others, poses=ONCE_AROUND.poses[:60])
+    feed(e, world.measurements())
+    assert e.stamps == [] and e.counts["images_not_found"] == 60
 
 
 def test_a_map_without_covariance_is_refused() -> None:

@@ -66,7 +66,7 @@ def odometry_at(result: ObjectMap, motions: Sequence[RelativeMotion]) -> tuple[A
     chain = MotionChain(MotionNoise(), np.eye(4))
     for motion in motions:
         chain.add(motion)
-    steps = [chain.between(start, end) for start, end in pairwise(result.stamps)]
+    steps = [(chain.measured(*pair), chain.between(*pair)[1]) for pair in pairwise(result.stamps)]
     return dead_reckoning(result.poses[0], result.covariances[0], steps)
 
 
