@@ -140,9 +140,9 @@ def test_without_noise_the_truth_comes_out() -> None:
 
 
 def test_widening_finds_the_minimum_near_the_truth() -> None:
-    """Seen: repetitions in which optimisation straight from odometry ends elsewhere."""
+    """In repetition 6 optimisation straight from odometry ends elsewhere."""
     settings, worse = ToySettings(), 0
-    for number in range(8):
+    for number in (5, 6):
         found = world(number, settings)
         noise = toy.noise_of(found, settings, "scale_0.125")
         posed, estimate = toy.optimise(found, settings, noise)
