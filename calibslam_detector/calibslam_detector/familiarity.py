@@ -13,7 +13,7 @@ import torch
 from torch import Tensor, nn
 
 USUAL = 0.95  # share of known images that are no stranger than 1
-HELD_OUT = 4  # each so-many-th image is not fitted to, but measured with
+HELD_OUT = 0.25  # share of the images, the last ones, that are not fitted to, but measured with: neighbours are alike
 SHRINKAGE = 0.01  # share of the mean variance added to all, as images are few
 
 
@@ -41,16 +41,18 @@ class Familiarity(nn.Module):
 
     @torch.no_grad()
     def fit(self, descriptors: Tensor) -> None:
-        """Know these images (N, C): the share USUAL of others like them will have a strangeness below 1."""
-        held_out = torch.arange(len(descriptors)) % HELD_OUT == HELD_OUT - 1
-        known = descriptors[~held_out].double()
+        """Know these images (N, C), N > 2: the share USUAL of others like them will have a strangeness below 1."""
+        last = len(descriptors) - max(round(HELD_OUT * len(descriptors)), 1)
+        known, held_out = descriptors[:last].double(), descriptors[last:]
         mean = known.mean(dim=0)
-        covariance = torch.cov(known.T) + torch.eye(len(mean)) * SHRINKAGE * known.var(dim=0).mean()
+        covariance = (
+            torch.cov(known.T) + torch.eye(len(mean), device=known.device) * SHRINKAGE * known.var(dim=0).mean()
+        )
         L = torch.linalg.cholesky(covariance)
         self.mean.copy_(mean)
         self.whitening.copy_(torch.linalg.inv(L))
         self.usual.fill_(1.0)
-        distances = self(descriptors[held_out].to(self.mean.device))
+        distances = self(held_out.to(self.mean.device))
         self.usual.fill_(max(float(torch.quantile(distances, USUAL)), math.ulp(1.0)))
 
     def forward(self, descriptors: Tensor) -> Tensor:
