@@ -18,7 +18,7 @@ from calibslam_sim.simulation import SCENARIOS, SimulationSettings, simulate
 
 OBJECTS = 15
 LONG = 1000  # keyframes
-IMAGE_RATE = 10.0  # [Hz]; keyframes are rarer
+IMAGE_RATE = 10.0  # [Hz]; keyframes are rarer, and what lies between two tells nothing but odometry
 COVERAGE = 0.9
 
 
@@ -83,7 +83,9 @@ def outlier_rows(seeds: int, duration: float, association: str) -> list[AnyRow]:
     errors: dict[str, list[float]] = {model: [] for model in models}
     with Progress(seeds * len(models), f"gross errors, association {association}") as progress:
         for seed in range(seeds):
-            recording = simulate(SimulationSettings(seed=seed, duration=duration, **SCENARIOS["desk_outliers"]))
+            recording = simulate(
+                SimulationSettings(seed=seed, duration=duration, frame_rate=IMAGE_RATE, **SCENARIOS["desk_outliers"])
+            )
             for model in models:
                 done = run(recording, EstimatorSettings(noise_model=model, association=association))
                 errors[model].append(done.ate())
