@@ -113,6 +113,17 @@ def test_a_file_that_is_no_data_set_is_refused(tmp_path: Path, text: str, messag
         load_coco_data(tmp_path / "none.json", tmp_path)
 
 
+def test_boxes_of_whole_objects_can_be_learnt(tmp_path: Path) -> None:
+    content = make_data(tmp_path)
+    with pytest.raises(DataError, match=r"annotation without amodal_bbox \(8\)"):
+        load_coco_data(tmp_path / "annotations.json", tmp_path / "images", box_key="amodal_bbox")
+    for annotation in content["annotations"]:
+        annotation["amodal_bbox"] = [1, 2, 3, 4]
+    (tmp_path / "annotations.json").write_text(json.dumps(content))
+    data = load_coco_data(tmp_path / "annotations.json", tmp_path / "images", box_key="amodal_bbox")
+    assert all((image.boxes == [1, 2, 4, 6]).all() for image in data.images)
+
+
 def test_classes_are_those_of_the_detector(data: Path) -> None:
     known = load_coco_data(data / "annotations.json", data / "images", ("chair", "book"))
     assert {int(label) for image in known.images for label in image.labels} == {2}
