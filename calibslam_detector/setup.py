@@ -17,14 +17,13 @@ setup(
     zip_safe=True,
     maintainer="CalibSLAM maintainers",
     maintainer_email="maintainers@calibslam.invalid",
-    description="Boxes with calibrated covariances: a detector and its training, and a calibrator for the boxes of any detector.",
+    description="Boxes with calibrated covariances: a detector and its training, and a calibrator for any detector.",
     license="Apache-2.0",
     entry_points={
         "console_scripts": [
             f"calibrator = {PACKAGE}.calibrator_node:main",
             f"detector = {PACKAGE}.detector_node:main",
             f"evaluate_detector = {PACKAGE}.evaluate_detector:main",
-            f"fit_calibrator = {PACKAGE}.fit_calibrator:main",
             f"train = {PACKAGE}.train:main",
         ],
         "calibslam.calibrators": [f"default = {PACKAGE}.calibrator:load"],
