@@ -42,7 +42,8 @@ class GraphSettings(Settings):
     robust_scale: float = setting(2.0, "Mahalanobis distance beyond which a box is doubted", low=0.1, high=1e6)
     robust_odometry: float = setting(3.5, "Mahalanobis distance beyond which a motion is doubted", low=0.1, high=1e6)
     prior_sigma: float = setting(0.001, "first pose: it is the map's origin", unit="rad and m", low=1e-6)
-    relinearise_every: int = setting(3, "keyframes between relinearisations of the whole graph", low=1)
+    relinearised_poses: int = setting(30, "earlier poses, with each new one, that may be relinearised", low=1)
+    relinearised_quadrics: int = setting(1, "settled quadrics, with each new pose, that may be relinearised", low=1)
     relinearise_pose: float = setting(0.01, "change of a pose that asks for one", unit="rad and m", low=0.0)
     relinearise_quadric: float = setting(0.03, "change of a quadric that asks for one", unit="m and log m", low=0.0)
     young: int = setting(20, "keyframes during which a quadric is relinearised at once", low=0)
@@ -88,6 +89,7 @@ class ObjectGraph:
     LARGEST_RADIUS, LARGEST_DISTANCE, SMALLEST_RADIUS = 10.0, 200.0, 1e-4
     LARGEST_STEP = 0.5  # [rad, m] of a pose in one update; more is checked by a damped optimisation
     REPAIR_ITERATIONS = 15
+    NEW_POSES = 5  # that are relinearised at once
     FOUND_SIGMA = 0.5  # [rad, m] of a pose found in a known map: its boxes say it better
 
     def __init__(self, K: Array, settings: GraphSettings, priors: InitialisationSettings, noise: MotionNoise) -> None:
@@ -227,10 +229,9 @@ class ObjectGraph:
         """One step of ISAM2; `everything` relinearises whatever has moved."""
         self._updates += 1
         before = gtsam.Values(self._smoother.values)
-        relinearise = everything or self._updates % self._settings.relinearise_every == 0
         reason = ""
         try:
-            self._smoother.update(self._last(), () if relinearise else self._settled())
+            self._smoother.update(self._last(), () if everything else self._held())
             if self._jumped(before):
                 reason = "the trajectory jumped"
         except RuntimeError as error:
@@ -253,12 +254,20 @@ class ObjectGraph:
         drift = [_D] if self._drifts else []
         return [*map(_q, self.landmarks), _x(self.size - 1), *drift]
 
-    def _settled(self) -> Iterator[int]:
-        """Everything but young quadrics and the newest poses keeps its linearisation point for now."""
-        yield from map(_x, range(self.size - 5))
-        for j, landmark in self.landmarks.items():
-            if self.size - landmark.born > self._settings.young:
-                yield _q(j)
+    def _held(self) -> Iterator[int]:
+        """What keeps its linearisation point for now, so that the work of an update is bounded.
+
+        The newest poses and young quadrics never do. Of the others a few consecutive poses and a quadric or so may be
+        relinearised with each update, in turn.
+        """
+        s = self._settings
+        poses = range(self.size - self.NEW_POSES)
+        quadrics = [j for j, landmark in self.landmarks.items() if self.size - landmark.born > s.young]
+        for ids, number, key in ((poses, s.relinearised_poses, _x), (quadrics, s.relinearised_quadrics, _q)):
+            turns = -(-len(ids) // number)
+            for i, each in enumerate(ids):
+                if i // number != self._updates % turns:
+                    yield key(each)
 
     def _sane(self, j: int) -> bool:
         vector = self.quadric(j)
