@@ -24,5 +24,6 @@ setup(
             f"backend = {PACKAGE}.backend_node:main",
             f"slam_bag = {PACKAGE}.slam_bag:main",
         ],
+        "calibslam.reference_boxes": [f"default = {PACKAGE}.reference_boxes:of_recording"],
     },
 )

@@ -24,6 +24,7 @@ setup(
             f"calibrator = {PACKAGE}.calibrator_node:main",
             f"detector = {PACKAGE}.detector_node:main",
             f"evaluate_detector = {PACKAGE}.evaluate_detector:main",
+            f"fit_calibrator = {PACKAGE}.fit_calibrator:main",
             f"train = {PACKAGE}.train:main",
         ],
         "calibslam.calibrators": [f"default = {PACKAGE}.calibrator:load"],

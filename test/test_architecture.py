@@ -68,7 +68,7 @@ def test_every_executable_can_be_loaded() -> None:
     """What setup.py names exists, as installed."""
     points = [
         point
-        for group in ("console_scripts", "calibslam.calibrators")
+        for group in ("console_scripts", "calibslam.calibrators", "calibslam.reference_boxes")
         for point in entry_points(group=group)
         if point.value.startswith("calibslam_")
     ]

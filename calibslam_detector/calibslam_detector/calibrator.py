@@ -1,7 +1,8 @@
 """Covariances for the boxes of somebody else's detector.
 
-The simplest honest model: an edge is wrong by a few pixels whatever the box, and by a share of the box's
-width or height; edges err independently. Its numbers are assumptions, not fitted to a detector.
+The default is the simplest honest model: an edge is wrong by a few pixels whatever the box, and by a share of the
+box's width or height; edges err independently. Its numbers are assumptions, not fitted to a detector.
+`fit_calibrator` fits a model to a detector and writes it to a file (docs/calibrator.md).
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
+from calibslam_detector.log_linear_calibrator import LogLinearCalibrator
 from calibslam_msgs_py.measurements import Array, Boxes
 from calibslam_msgs_py.settings import Settings, SettingsError, from_mapping, setting
 
@@ -44,14 +46,17 @@ class PerSizeCalibrator(Settings):
 
 
 # What a calibrator file may hold: the class by the file's `kind`.
-KINDS = {"per_size": PerSizeCalibrator}
+KINDS: dict[str, type[PerSizeCalibrator] | type[LogLinearCalibrator]] = {
+    "per_size": PerSizeCalibrator,
+    "log_linear": LogLinearCalibrator,
+}
 
 
-def load(path: str | None = None) -> PerSizeCalibrator:
+def load(path: str | None = None) -> PerSizeCalibrator | LogLinearCalibrator:
     """The calibrator of a file, or the one with default numbers.
 
     A file is JSON: `{"version": 1, "kind": "per_size", "parameters": {"floor": 2.0, "relative": 0.04}}`;
-    parameters left out keep their defaults.
+    parameters left out keep their defaults. `fitted_on`, an object, may say where the numbers come from.
 
     Raises:
         CalibratorError: naming the file and what is wrong with it.
@@ -66,7 +71,7 @@ def load(path: str | None = None) -> PerSizeCalibrator:
         raise CalibratorError(f"calibrator file {path} is not JSON: {error}") from None
     if not isinstance(content, dict) or content.get("version") != FILE_VERSION:
         raise CalibratorError(f'calibrator file {path} does not say "version": {FILE_VERSION}')
-    unknown = sorted(set(content) - {"version", "kind", "parameters"})
+    unknown = sorted(set(content) - {"version", "kind", "parameters", "fitted_on"})
     if unknown:
         raise CalibratorError(f"calibrator file {path}: unknown key {', '.join(unknown)}")
     kind = content.get("kind")
