@@ -42,7 +42,7 @@ class AssociationSettings(Settings):
     ambiguity: float = setting(
         3.0, "log of the odds over the second best quadric below which a decision waits", low=0.0, high=100.0
     )
-    revised: int = setting(10, "earlier keyframes, with each new one, whose boxes are judged anew", low=0)
+    revised: int = setting(20, "earlier keyframes, with each new one, whose boxes are judged anew", low=0)
     wrong_class: float = setting(0.05, "share of boxes that carry a wrong class", low=1e-6, high=0.5)
     merge_distance: float = setting(
         0.7,
