@@ -130,7 +130,7 @@ def test_judged_on_other_edges() -> None:
 
 
 def test_objects_are_held_out_not_images() -> None:
-    """Errors of one object are 30 times as large, and a feature tells that object: only who saw it knows what it means."""
+    """One object errs 30 times as much, and a feature tells which: only who saw it knows what that means."""
     edges = Edges.of(images(0))
     judged = held_out(edges)
     assert judged.edges == len(edges.errors)
