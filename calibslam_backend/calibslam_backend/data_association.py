@@ -382,7 +382,7 @@ class DataAssociation:
         return gone
 
     def spread_over_all(self) -> None:
-        """Covariances of boxes from the spread of all boxes of their quadric (document, eq. 4.3.1), not of those so far."""
+        """Covariances of boxes from the spread of all boxes of their quadric, not of those so far (eq. 4.3.1)."""
         for j, landmark in self._graph.landmarks.items():
             if not landmark.boxes:
                 continue
