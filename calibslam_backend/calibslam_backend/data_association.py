@@ -29,7 +29,7 @@ from calibslam_backend.estimator_settings import EstimatorSettings
 from calibslam_backend.graph import ObjectGraph, UpdateReport
 from calibslam_backend.initialisation import initialise
 from calibslam_backend.localisation import localise
-from calibslam_backend.noise import NoiseModel
+from calibslam_backend.noise import NoiseModel, spread
 from calibslam_backend.relocalisation import Relocalised, relocalise
 from calibslam_backend.revision import revise
 from calibslam_backend.tracking import overlap
@@ -380,6 +380,16 @@ class DataAssociation:
                     gone.append(j)
                     break
         return gone
+
+    def spread_over_all(self) -> None:
+        """Covariances of boxes from the spread of all boxes of their quadric, not of those so far (eq. 4.3.1)."""
+        for j, landmark in self._graph.landmarks.items():
+            if not landmark.boxes:
+                continue
+            sigma = spread(np.stack([box.corners for box in landmark.boxes.values()])) * self.settings.covariance_scale
+            for k, box in list(landmark.boxes.items()):
+                self._graph.remove_box(k, j)
+                self._graph.add_box(k, j, replace(box, whitener=np.eye(4) / sigma))
 
     def note(self, report: UpdateReport) -> None:
         """Book what the graph took out: its boxes and tracks are open again."""

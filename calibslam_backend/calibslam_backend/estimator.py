@@ -26,6 +26,7 @@ from calibslam_backend.data_association import DataAssociation
 from calibslam_backend.estimator_settings import EstimatorSettings
 from calibslam_backend.graph import Motion, ObjectGraph
 from calibslam_backend.kernels import load_kernels
+from calibslam_backend.noise import QUADRICSLAM
 from calibslam_backend.object_map import ObjectMap
 from calibslam_backend.odometry import MotionChain
 from calibslam_backend.quadric import Ellipsoid, covariance_of_pose_and_radii, covariance_of_vector
@@ -248,7 +249,9 @@ class Estimator:
         return [pair for frame in frames for pair in zip(frame.quadrics, frame.names, strict=True)]
 
     def optimise(self) -> None:
-        """Move the whole graph to its batch optimum."""
+        """Move the whole graph to its batch optimum; the noise model `quadricslam` then knows all boxes."""
+        if self.settings.noise_model == QUADRICSLAM:
+            self._objects.spread_over_all()
         self._graph.optimise()
 
     # -- one image ----------------------------------------------------------------------------------------------

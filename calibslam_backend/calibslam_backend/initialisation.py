@@ -16,8 +16,9 @@ from numpy.typing import NDArray
 
 from calibslam_backend.box_factor import INVISIBLE, whitened_residual
 from calibslam_backend.box_measurement import BoxMeasurement
-from calibslam_backend.quadric import Ellipsoid
+from calibslam_backend.quadric import Ellipsoid, box_of_visible_part
 from calibslam_backend.robust import robust_loss
+from calibslam_backend.tracking import overlap
 from calibslam_msgs_py.measurements import Array
 from calibslam_msgs_py.settings import Settings, setting
 
@@ -32,6 +33,12 @@ class InitialisationSettings(Settings):
         0.1, "largest standard deviation of the centre, as a share of its distance", low=0.0, high=1.0
     )
     max_residual: float = setting(3.0, "largest median distance of a box, in standard deviations", low=0.1)
+    min_fit: float = setting(
+        0.8,
+        "median overlap of boxes that suffices whatever their standard deviations",
+        low=0.0,
+        high=1.0,
+    )
     max_radius: float = setting(3.0, "largest semi-axis", unit="m", low=0.01)
     prior_centre: float = setting(10.0, "weak prior on the centre of a quadric", unit="m", low=1e-3)
     prior_shape: float = setting(0.3, "prior on the proportions of a quadric: logarithm of its radii", low=1e-3)
@@ -109,11 +116,20 @@ def initialise(
     if (
         not np.isfinite(distances).all()
         or centre_sigma > settings.max_depth_uncertainty * depth
-        or np.median(distances) > settings.max_residual
+        or (np.median(distances) > settings.max_residual and _fit(poses, boxes, vector, K) < settings.min_fit)
         or largest > settings.max_radius
     ):
         return None
     return Initialised(vector, covariance, distances)
+
+
+def _fit(poses: Array, boxes: list[BoxMeasurement], vector: Array, K: Array) -> float:
+    """Median intersection over union of measured boxes and those of the quadric.
+
+    Sharp boxes contradict poses that are less certain than they are; that is no fault of the quadric.
+    """
+    predicted = [box_of_visible_part(T, vector, K, b.bounds, b.clip)[1] for T, b in zip(poses, boxes, strict=True)]
+    return float(np.median([overlap(p[None], b.corners[None])[0, 0] for p, b in zip(predicted, boxes, strict=True)]))
 
 
 def _first_guess(poses: Array, corners: Array, clip: NDArray[np.bool_], K: Array) -> Array | None:

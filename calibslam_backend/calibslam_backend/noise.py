@@ -1,8 +1,9 @@
 """Covariances of measured boxes: the models the document compares (sections 4.3.1, 5.2.1 and 5.2.4).
 
 `fixed` gives every edge the same standard deviation (eq. 5.2.1). `quadricslam` takes for each object the spread
-of its box sizes over time (eq. 4.3.1); here as a running estimate over the boxes seen so far, since a robot does not
-know the ones to come. `calibrated` believes the covariance that came with the box (eq. 4.3.2).
+of its box sizes over time (eq. 4.3.1): online as a running estimate over the boxes seen so far, since a robot does
+not know the ones to come, and over all of them where the whole graph is optimised at the end (`--batch`).
+`calibrated` believes the covariance that came with the box (eq. 4.3.2).
 """
 
 from __future__ import annotations
@@ -53,11 +54,17 @@ class RunningSpread:
         return float(np.sqrt(self._sum_of_squares / self.count).sum())
 
 
+# A box seen twice alike has no spread; a detector is never better than this [px].
+LEAST_SPREAD = 1.0
+
+
+def spread(corners: Array) -> float:
+    """sigma_w + sigma_h [px] of boxes (N, 4) of one object (eq. 4.3.1)."""
+    return max(float((corners[:, 2:] - corners[:, :2]).std(axis=0).sum()), LEAST_SPREAD)
+
+
 class NoiseModel:
     """Gives each box of an object the covariance the factor graph uses."""
-
-    # A box seen twice alike has no spread; a detector is never better than this [px].
-    LEAST_SPREAD = 1.0
 
     def __init__(self, settings: NoiseSettings) -> None:
         self._settings = settings
@@ -74,6 +81,6 @@ class NoiseModel:
         if settings.noise_model == CALIBRATED and not np.isnan(own[0, 0]):
             return settings.covariance_scale**2 * own
         if settings.noise_model == QUADRICSLAM and object_key in self._spreads:
-            spread = self._spreads[object_key].sigma()
-            sigma = sigma if np.isnan(spread) else max(spread, self.LEAST_SPREAD)
+            running = self._spreads[object_key].sigma()
+            sigma = sigma if np.isnan(running) else max(running, LEAST_SPREAD)
         return np.eye(4) * (settings.covariance_scale * sigma) ** 2

@@ -16,7 +16,7 @@ from calibslam_backend import metrics
 from calibslam_backend.association import ESTIMATED, GIVEN
 from calibslam_backend.estimator import Estimator, EstimatorSettings, Keyframe
 from calibslam_backend.graph import T_MAP_FIRST_CAMERA, ObjectGraph
-from calibslam_backend.noise import FIXED
+from calibslam_backend.noise import FIXED, QUADRICSLAM
 from calibslam_backend.object_map import ObjectMap, tum_lines
 from calibslam_backend.quadric import Ellipsoid
 from calibslam_msgs_py.measurements import Boxes, InvalidMeasurement, RelativeMotion
@@ -451,6 +451,23 @@ def test_the_batch_optimum_is_near_the_incremental_one() -> None:
     e.optimise()
     assert np.abs(e.trajectory() - before).max() < 0.02
     assert metrics.ate(estimated(e), ONCE_AROUND.truth()) < 0.03
+
+
+def test_quadricslam_in_batch_knows_the_spread_of_all_boxes() -> None:
+    """sigma_w + sigma_h over the boxes of a quadric, by hand from the true identities."""
+    e = run(ONCE_AROUND, noise_model=QUADRICSLAM)
+    e.optimise()
+    stamps = set(e.stamps)
+    for j, landmark in e._graph.landmarks.items():
+        (name,) = {name for quadric, name in e.associations() if quadric == j}
+        boxes = [b for b in ONCE_AROUND.boxes() if b.stamp in stamps and name in b.object_ids]
+        corners = np.stack([b.corners[b.object_ids.index(name)] for b in boxes])
+        if len(corners) == len(landmark.boxes):
+            sigma = np.std(corners[:, 2] - corners[:, 0]) + np.std(corners[:, 3] - corners[:, 1])
+            for box in landmark.boxes.values():
+                np.testing.assert_allclose(box.whitener, np.eye(4) / sigma, rtol=1e-9)
+            return
+    pytest.fail("no quadric has all boxes of its object")
 
 
 def test_stamps_keep_their_nanoseconds() -> None:

@@ -5,7 +5,15 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from calibslam_backend.noise import CALIBRATED, FIXED, QUADRICSLAM, NoiseModel, NoiseSettings, RunningSpread
+from calibslam_backend.noise import (
+    CALIBRATED,
+    FIXED,
+    LEAST_SPREAD,
+    QUADRICSLAM,
+    NoiseModel,
+    NoiseSettings,
+    RunningSpread,
+)
 from calibslam_msgs_py.settings import SettingsError
 
 OWN = np.array([[4.0, 1, 0.5, 0], [1, 9, 0, 0.5], [0.5, 0, 5, -1], [0, 0.5, -1, 6]])
@@ -51,7 +59,7 @@ def test_boxes_that_never_change_are_not_believed_exact() -> None:
     noise = model(QUADRICSLAM)
     for _ in range(5):
         noise.observe(0, np.array([1.0, 2.0, 3.0, 4.0]))
-    np.testing.assert_array_equal(noise.covariance(0, OWN), np.eye(4) * NoiseModel.LEAST_SPREAD**2)
+    np.testing.assert_array_equal(noise.covariance(0, OWN), np.eye(4) * LEAST_SPREAD**2)
 
 
 def test_running_spread_is_that_of_all_boxes() -> None:
