@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 from calibslam_backend.association import AssociationSettings, class_cost
-from calibslam_backend.box_measurement import BoxMeasurement
 from calibslam_backend.quadric import ALL_EDGES, Ellipsoid, box_of_visible_part, image_bounds
 from calibslam_backend.revision import COHERENCE, revise, squared_distances
 from calibslam_msgs_py.measurements import Array
@@ -39,9 +38,11 @@ def seen(quadric: Array) -> Array:
 QUADRICS = np.stack([at(-0.05), at(0.05)])
 
 
-def arrays(boxes: Sequence[Array], sigma: float = SIGMA) -> list[BoxMeasurement]:
-    """Boxes as `revise` takes them."""
-    return [BoxMeasurement(corners, np.eye(4) / sigma, BOUNDS, ~ALL_EDGES) for corners in boxes]
+def arrays(boxes: Sequence[Array]) -> list[Array]:
+    """Corners, whiteners, bounds and clip of boxes, as `revise` takes them."""
+    n = len(boxes)
+    whiteners, clip = np.tile(np.eye(4) / SIGMA, (n, 1, 1)), np.zeros((n, 4), bool)
+    return [np.reshape(boxes, (n, 4)), whiteners, np.tile(BOUNDS, (n, 1)), clip]
 
 
 def whose(
@@ -128,8 +129,7 @@ def test_the_bonus_of_coherence_by_hand(share: float, expected: int | None) -> N
 def test_distances_by_hand() -> None:
     """q = sum of (edge / sigma)^2, sigma^2 = 3^2 + (0.1 * 50)^2 with a model error of a tenth of the box."""
     box = seen(QUADRICS[0]) + np.array([1.0, 2.0, -3.0, 4.0])
-    measured = arrays([box])
-    stacked = [np.stack([getattr(b, name) for b in measured]) for name in ("corners", "whitener", "bounds", "clip")]
+    stacked = arrays([box])
     found = squared_distances(np.eye(4), QUADRICS, K, np.array([640.0, 480.0]), *stacked, 0.1)
     size = seen(QUADRICS[0])[2:] - seen(QUADRICS[0])[:2]
     variance = SIGMA**2 + (0.1 * np.tile(size, 2)) ** 2
