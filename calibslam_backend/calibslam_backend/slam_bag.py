@@ -52,11 +52,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"error: {error}", file=sys.stderr)
         return 1
     if not metrics["keyframes"]:
-        lost = "images_not_found" in str(metrics["rejected"])
+        rejected = metrics["rejected"]
         why = (
             f"the camera was not found in {parsed.map}: does it show objects of that map? If it starts where that map "
             "was begun, say --start-in-map begin"
-            if lost
+            if isinstance(rejected, dict) and "images_not_found" in rejected
             else "no image lies within the time of the odometry: do their clocks agree?"
         )
         print(f"error: {parsed.bag}: {why}", file=sys.stderr)

@@ -199,6 +199,45 @@ def test_a_covariance_with_nan_is_refused() -> None:
     assert caught.value.reason == "covariance"
 
 
+# -- motions that no body can make ----------------------------------------------------------------------------------
+
+
+def moved(k: int, x: float, covariance: Array | None = None) -> RelativeMotion:
+    """x metres along the body's x axis within a step of 0.1 s."""
+    return motion(k, gtsam.Pose3(gtsam.Rot3(), np.array([x, 0.0, 0.0])), covariance)
+
+
+def test_an_impossible_step_is_replaced_by_going_on_as_before() -> None:
+    """0.1, 1.5, 0.1 m in 0.1 s each: from 1 to 15 m/s in a step, where 3 g allow 3 m/s."""
+    chain = MotionChain(MotionNoise(translation_floor=0.01, translation_share=0.0), np.eye(4))
+    said = [chain.add(moved(k, x)) for k, x in enumerate((0.1, 1.5, 0.1))]
+    assert said == ["", "odometry_implausible", ""]
+    T, covariance = chain.between(T0, T0 + 3 * STEP)
+    assert T[0, 3] == pytest.approx(0.3)
+    assert covariance[3, 3] == pytest.approx(0.01**2 + 0.1**2)  # 1 m/s for 0.1 s, unseen
+    assert chain.measured(T0, T0 + 3 * STEP)[0, 3] == pytest.approx(1.7)
+    assert chain.between(T0 + 2 * STEP, T0 + 3 * STEP)[1][3, 3] == pytest.approx(0.01**2)
+
+
+def test_two_impossible_steps_that_agree_are_a_new_motion() -> None:
+    chain = MotionChain(MotionNoise(), np.eye(4))
+    assert [bool(chain.add(moved(k, x))) for k, x in enumerate((0.1, 1.5, 1.5, 1.5))] == [False, True, False, False]
+
+
+def test_what_a_stated_covariance_explains_is_possible() -> None:
+    """A change of 14 m/s: sigma 0.5 m in 0.1 s explains 3 sqrt(2) 5 m/s about each axis."""
+    for sigma, expected in ((0.5, ""), (0.02, "odometry_implausible")):
+        chain = MotionChain(MotionNoise(), np.eye(4))
+        chain.add(moved(0, 0.1, np.eye(6) * sigma**2))
+        assert chain.add(moved(1, 1.5, np.eye(6) * sigma**2)) == expected
+
+
+def test_after_a_gap_any_velocity_is_possible() -> None:
+    chain = MotionChain(MotionNoise(), np.eye(4))
+    chain.add(moved(0, 0.1))
+    assert chain.add(moved(5, 1.5)) == "odometry_gap"
+
+
 # -- what is believed of motions without covariance -----------------------------------------------------------------
 
 

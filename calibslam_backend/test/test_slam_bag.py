@@ -91,6 +91,26 @@ def test_two_runs_write_the_same_bytes(bag: Path, tmp_path: Path, options: list[
         assert (tmp_path / "a" / file).read_bytes() == (tmp_path / "b" / file).read_bytes(), file
 
 
+def test_a_map_is_gone_on_with(bag: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Found or begun in the map of a run before: no object is begun a second time."""
+    run(bag, tmp_path / "first")
+    known = str(tmp_path / "first" / "map.json")
+    for start in ("found", "begin"):
+        metrics = run(bag, tmp_path / start, "--map", known, "--start-in-map", start)
+        assert metrics["objects"] == 9 and metrics["ate_m"] < 0.05
+    assert "cannot be read" in fails(bag, tmp_path / "x", capsys, "--map", str(tmp_path / "no.json"))
+
+
+def test_a_camera_outside_the_map_is_told(bag: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    run(bag, tmp_path / "first")
+    content = json.loads((tmp_path / "first" / "map.json").read_text())
+    for quadric in content["quadrics"]:
+        quadric["class_id"] = "whale"
+    (tmp_path / "sea.json").write_text(json.dumps(content))
+    said = fails(bag, tmp_path / "run", capsys, "--map", str(tmp_path / "sea.json"))
+    assert "was not found in" in said and "--start-in-map begin" in said
+
+
 def test_a_run_is_replaced_by_the_next(bag: Path, tmp_path: Path) -> None:
     run(bag, tmp_path / "run", "--noise-model", "fixed")
     assert run(bag, tmp_path / "run")["settings"]["noise_model"] == "calibrated"
