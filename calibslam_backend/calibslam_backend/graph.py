@@ -68,9 +68,11 @@ class Motion:
 
 @dataclass
 class Landmark:
-    """What the graph knows of a quadric: the keyframe it was born in, and its boxes by keyframe."""
+    """What the graph knows of a quadric: the keyframe it was born in, the covariance (9, 9) of its prior, and its boxes
+    by keyframe."""
 
     born: int
+    prior: Array
     boxes: dict[int, BoxMeasurement] = field(default_factory=dict)
 
 
@@ -149,11 +151,13 @@ class ObjectGraph:
         return self._smoother.marginal(_x(k))
 
     def quadric_covariances(self) -> dict[int, Array]:
-        """For each quadric (9, 9) of its vector."""
-        if not self.landmarks:
-            return {}
-        joint = self._smoother.joint([_q(j) for j in self.landmarks])
-        return {j: np.asarray(joint.at(_q(j), _q(j))) for j in self.landmarks}
+        """For each quadric (9, 9) of its vector; its prior's where no update has been done yet."""
+        solved = [j for j in self.landmarks if self.is_solved(j)]
+        joint = self._smoother.joint([_q(j) for j in solved]) if solved else None
+        return {
+            j: np.asarray(joint.at(_q(j), _q(j))) if joint is not None and self.is_solved(j) else landmark.prior
+            for j, landmark in self.landmarks.items()
+        }
 
     def joint_covariances(self, k: int, quadrics: list[int]) -> list[Array]:
         """For each of these quadrics (15, 15) of pose k and the quadric: columns of `quadric.box_of_visible_part`."""
@@ -200,7 +204,7 @@ class ObjectGraph:
 
     def add_known_quadric(self, j: int, vector: Array, covariance: Array) -> None:
         """A quadric that is known as well as this covariance (9, 9) says."""
-        self.landmarks[j] = Landmark(self.size)
+        self.landmarks[j] = Landmark(self.size, covariance)
         noise = gtsam.noiseModel.Gaussian.Covariance(covariance)
         self._smoother.insert(_q(j), vector)
         self._smoother.add(("prior", j), gtsam.PriorFactorVector(_q(j), vector, noise))
