@@ -299,23 +299,22 @@ class DataAssociation:
         if not ids:
             return 0
         quadrics = np.stack([self._graph.quadric(j) for j in ids])
-        settled = len(self.frames) - (self.UNSETTLED if number is not None else 0)
-        if number is None:
-            turn: Iterable[int] = range(len(self.frames))
-        else:
-            turn = (
-                [k % settled for k in range(self._revised, self._revised + min(number, settled))] if settled > 0 else []
-            )
-            self._revised = (turn[-1] + 1) % settled if turn else 0
-        changed = 0
-        for k in turn:
-            changed += self._revise_frame(k, ids, quadrics)
+        turn = range(len(self.frames)) if number is None else self._next_settled(number)
+        changed = sum(self._revise_frame(k, ids, quadrics) for k in turn)
         for j in [j for j in ids if j not in self._known and len(self._graph.landmarks[j].boxes) < self.LEAST_BOXES]:
             self._graph.remove_quadric(j)
             self._forget(j)
             self.counts["quadrics_revised_away"] += 1
         self.counts["revised"] += changed
         return changed
+
+    def _next_settled(self, number: int) -> list[int]:
+        """The earlier keyframes whose turn it is."""
+        settled = len(self.frames) - self.UNSETTLED
+        turn = [k % settled for k in range(self._revised, self._revised + min(number, settled))]
+        if turn:
+            self._revised = (turn[-1] + 1) % settled
+        return turn
 
     def _revise_frame(self, k: int, ids: list[int], quadrics: Array) -> int:
         frame = self.frames[k]
