@@ -11,6 +11,7 @@ from __future__ import annotations
 import functools
 import math
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -71,6 +72,19 @@ def predicted_corners(T_map_camera: Array, quadric: Array, K: Array, box: BoxMea
     """The corners alone (4,) [px] of `predict`."""
     visible, corners, _ = box_of_visible_part(T_map_camera, quadric, K, box.bounds, box.clip)
     return np.asarray(corners) if visible else None
+
+
+def median_overlap(poses: Array, boxes: Sequence[BoxMeasurement], quadric: Array, K: Array) -> float:
+    """Median intersection over union of N measured boxes and those of a quadric (9,), seen from poses (N, 4, 4).
+
+    Zero counts where the quadric is not in front of the camera, or its box is empty.
+    """
+    overlaps = np.zeros(len(boxes))
+    for n, (T, box) in enumerate(zip(poses, boxes, strict=True)):
+        corners = predicted_corners(np.ascontiguousarray(T), quadric, K, box)
+        if corners is not None and (corners[2:] > corners[:2]).all():
+            overlaps[n] = overlap(corners[None], box.corners[None])[0, 0]
+    return float(np.median(overlaps))
 
 
 def predict(

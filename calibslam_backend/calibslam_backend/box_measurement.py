@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -29,6 +31,11 @@ class BoxMeasurement:
     whitener: Array
     bounds: Array
     clip: NDArray[np.bool_]
+
+
+def stacked(boxes: Sequence[BoxMeasurement]) -> list[NDArray[Any]]:
+    """Corners (N, 4), whiteners (N, 4, 4), bounds (N, 4) and clip (N, 4) of N boxes, at least one."""
+    return [np.stack([getattr(box, name) for box in boxes]) for name in ("corners", "whitener", "bounds", "clip")]
 
 
 def undistorted(corners: Array, camera: Camera) -> Array:

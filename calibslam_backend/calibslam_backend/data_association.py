@@ -24,7 +24,7 @@ from calibslam_backend.association import (
     same_object,
     unambiguous,
 )
-from calibslam_backend.box_measurement import BoxMeasurement, prepare
+from calibslam_backend.box_measurement import BoxMeasurement, prepare, stacked
 from calibslam_backend.estimator_settings import EstimatorSettings
 from calibslam_backend.graph import ObjectGraph, UpdateReport
 from calibslam_backend.initialisation import initialise
@@ -57,7 +57,7 @@ class Frame:
     @functools.cached_property
     def arrays(self) -> list[Array]:
         """(N, ...) corners, whiteners, bounds and clip of the boxes."""
-        return [np.stack([getattr(b, name) for b in self.boxes]) for name in ("corners", "whitener", "bounds", "clip")]
+        return stacked(self.boxes)
 
 
 @dataclass
@@ -188,19 +188,7 @@ class DataAssociation:
 
     def find(self, frame: Frame) -> Relocalised | None:
         """Where in a loaded map a camera with these boxes is."""
-        known = list(self._graph.landmarks)
-        classes = np.array([self.class_of_quadric(j) for j in known])
-        found = relocalise(
-            None,
-            frame.boxes,
-            np.stack([self._graph.quadric(j) for j in known]),
-            np.reshape([classes == self._class_of(track) for track in frame.tracks], (-1, len(known))),
-            self.camera.K,
-            (self.camera.width, self.camera.height),
-            self.settings.robust_scale,
-            self.settings,
-        )
-        return found and replace(found, pairs=[(n, known[m]) for n, m in found.pairs])
+        return self._relocalised(frame, None, list(self._graph.landmarks))
 
     def bind_found(self, frame: Frame, found: Relocalised) -> None:
         """The boxes of the keyframe where the camera was found belong to the quadrics that it was found by."""
@@ -214,35 +202,42 @@ class DataAssociation:
 
     def relocalise(self, k: int) -> None:
         """Where the boxes show known objects from another pose than the predicted one, vote for those."""
-        tracks, measurements = self.frames[k].tracks, self.frames[k].boxes
+        tracks = self.frames[k].tracks
         if self.settings.association == GIVEN or not any(self._recent(t, k) for t in tracks):
             return
-        known = [j for j in self._graph.landmarks if self._graph.is_solved(j)]
-        if not known:
-            return
         # A young quadric is what is in question: it may be an old one, seen from where the camera is not.
-        old = np.array([k - self._graph.landmarks[j].born > self.YOUNG for j in known])
+        old = [
+            j
+            for j, landmark in self._graph.landmarks.items()
+            if self._graph.is_solved(j) and k - landmark.born > self.YOUNG
+        ]
+        found = self._relocalised(self.frames[k], self._graph.pose(k), old)
+        if found is None:
+            return
+        self.counts["relocalised"] += 1
+        for n, j in found.pairs:
+            bound = self._candidates[tracks[n]].quadric
+            if bound is None:
+                self._vote_for(tracks[n], j)
+            elif bound != j and self._votes.add(~bound, j) == j:
+                self._same.append((bound, j))
+
+    def _relocalised(self, frame: Frame, predicted: Array | None, known: list[int]) -> Relocalised | None:
+        """A better pose than the predicted one by these quadrics; its pairs are (row, id of the quadric)."""
+        if not known:
+            return None
         classes = np.array([self.class_of_quadric(j) for j in known])
-        compatible = np.stack([old & (classes == self._class_of(track)) for track in tracks])
         found = relocalise(
-            self._graph.pose(k),
-            measurements,
+            predicted,
+            frame.boxes,
             np.stack([self._graph.quadric(j) for j in known]),
-            compatible,
+            np.reshape([classes == self._class_of(track) for track in frame.tracks], (-1, len(known))),
             self.camera.K,
             (self.camera.width, self.camera.height),
             self.settings.robust_scale,
             self.settings,
         )
-        if found is None:
-            return
-        self.counts["relocalised"] += 1
-        for n, m in found.pairs:
-            bound = self._candidates[tracks[n]].quadric
-            if bound is None:
-                self._vote_for(tracks[n], known[m])
-            elif bound != known[m] and self._votes.add(~bound, known[m]) == known[m]:
-                self._same.append((bound, known[m]))
+        return found and replace(found, pairs=[(n, known[m]) for n, m in found.pairs])
 
     def start_quadrics(self, tracks: Iterable[int]) -> list[int]:
         """Begin a quadric for each open track whose boxes determine one; returns the new ones."""

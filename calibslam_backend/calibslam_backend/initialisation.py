@@ -14,11 +14,11 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from calibslam_backend.association import median_overlap
 from calibslam_backend.box_factor import INVISIBLE, whitened_residual
-from calibslam_backend.box_measurement import BoxMeasurement
-from calibslam_backend.quadric import Ellipsoid, box_of_visible_part
+from calibslam_backend.box_measurement import BoxMeasurement, stacked
+from calibslam_backend.quadric import Ellipsoid
 from calibslam_backend.robust import robust_loss
-from calibslam_backend.tracking import overlap
 from calibslam_msgs_py.measurements import Array
 from calibslam_msgs_py.settings import Settings, setting
 
@@ -89,8 +89,7 @@ def initialise(
     if len(boxes) > settings.max_boxes:
         chosen = np.linspace(0, len(boxes) - 1, settings.max_boxes).round().astype(int)
         poses, boxes = poses[chosen], [boxes[i] for i in chosen]
-    corners, whiteners, bounds = (np.stack([getattr(b, n) for b in boxes]) for n in ("corners", "whitener", "bounds"))
-    clip = np.stack([b.clip for b in boxes])
+    corners, whiteners, bounds, clip = stacked(boxes)
     guess = _first_guess(poses, corners, clip, K)
     if guess is None:
         return None
@@ -113,23 +112,15 @@ def initialise(
     depth = np.median(np.linalg.norm(poses[:, :3, 3] - vector[:3], axis=1))
     centre_sigma = np.sqrt(np.linalg.eigvalsh(by_boxes[:3, :3])[-1])
     largest = Ellipsoid.from_vector(vector).radii.max()
+    # Sharp boxes contradict poses less certain than they are: where boxes fit well, the quadric is not at fault.
     if (
         not np.isfinite(distances).all()
         or centre_sigma > settings.max_depth_uncertainty * depth
-        or (np.median(distances) > settings.max_residual and _fit(poses, boxes, vector, K) < settings.min_fit)
+        or (np.median(distances) > settings.max_residual and median_overlap(poses, boxes, vector, K) < settings.min_fit)
         or largest > settings.max_radius
     ):
         return None
     return Initialised(vector, covariance, distances)
-
-
-def _fit(poses: Array, boxes: list[BoxMeasurement], vector: Array, K: Array) -> float:
-    """Median intersection over union of measured boxes and those of the quadric.
-
-    Sharp boxes contradict poses that are less certain than they are; that is no fault of the quadric.
-    """
-    predicted = [box_of_visible_part(T, vector, K, b.bounds, b.clip)[1] for T, b in zip(poses, boxes, strict=True)]
-    return float(np.median([overlap(p[None], b.corners[None])[0, 0] for p, b in zip(predicted, boxes, strict=True)]))
 
 
 def _first_guess(poses: Array, corners: Array, clip: NDArray[np.bool_], K: Array) -> Array | None:

@@ -12,7 +12,7 @@ import numba
 import numpy as np
 
 from calibslam_backend.box_factor import INVISIBLE, whitened_residual
-from calibslam_backend.box_measurement import BoxMeasurement
+from calibslam_backend.box_measurement import BoxMeasurement, stacked
 from calibslam_backend.robust import robust_loss
 from calibslam_msgs_py.measurements import Array
 
@@ -64,7 +64,7 @@ class _Seen:
     """Quadrics and their boxes as arrays."""
 
     def __init__(self, vectors: Array, boxes: list[BoxMeasurement], K: Array, robust_scale: float) -> None:
-        self._measured = [np.stack([getattr(b, n) for b in boxes]) for n in ("corners", "whitener", "bounds", "clip")]
+        self._measured = stacked(boxes)
         self._vectors, self._K, self._robust_scale = vectors, K, robust_scale
 
     def add(self, pose: gtsam.Pose3, H: Array, g: Array) -> float:

@@ -15,12 +15,12 @@ from pathlib import Path
 
 import numpy as np
 
+from calibslam_backend.association import median_overlap, predicted_corners
 from calibslam_backend.box_measurement import BoxMeasurement, prepare
 from calibslam_backend.initialisation import InitialisationSettings, initialise
 from calibslam_backend.metrics import Trajectory, interpolated
-from calibslam_backend.quadric import box_of_visible_part
 from calibslam_backend.recording import Recording
-from calibslam_backend.tracking import Tracker, TrackingSettings, overlap, unique
+from calibslam_backend.tracking import Tracker, TrackingSettings, unique
 from calibslam_msgs_py.bags import BagError
 from calibslam_msgs_py.measurements import Array, Boxes, Camera
 from calibslam_msgs_py.settings import setting
@@ -159,23 +159,19 @@ class _Fit:
             yield refined, sights
 
     def _fitted(self, sights: list[_Sight]) -> Array | None:
-        boxes = [self._measured[s.image][s.box] for s in sights]
-        poses = self._poses[[s.image for s in sights]]
-        found = initialise(poses, boxes, self._K, self._settings.robust_scale, self._settings)
+        found = initialise(*self._seen(sights), self._K, self._settings.robust_scale, self._settings)
         return None if found is None else found.vector
 
     def _predicted(self, quadric: Array, sight: _Sight) -> Array | None:
         """(4,) box of the quadric where the measured one is; None if it is not in front of the camera."""
         box = self._measured[sight.image][sight.box]
         pose = np.ascontiguousarray(self._poses[sight.image])
-        visible, corners, _ = box_of_visible_part(pose, quadric, self._K, box.bounds, box.clip)
-        return corners if visible else None
+        return predicted_corners(pose, quadric, self._K, box)
 
     def _agreement(self, quadric: Array, track: list[_Sight]) -> float:
         """Median intersection over union of the boxes of a track with those of a quadric."""
-        overlaps = np.zeros(len(track))
-        for n, sight in enumerate(track):
-            predicted = self._predicted(quadric, sight)
-            if predicted is not None and (predicted[2:] > predicted[:2]).all():
-                overlaps[n] = overlap(predicted[None], self._measured[sight.image][sight.box].corners[None])[0, 0]
-        return float(np.median(overlaps))
+        return median_overlap(*self._seen(track), quadric, self._K)
+
+    def _seen(self, sights: list[_Sight]) -> tuple[Array, list[BoxMeasurement]]:
+        """Poses (N, 4, 4) and boxes."""
+        return self._poses[[s.image for s in sights]], [self._measured[s.image][s.box] for s in sights]
