@@ -26,6 +26,7 @@ setup(
         "console_scripts": [
             f"calibrator = {PACKAGE}.calibrator_node:main",
             f"detect_bag = {PACKAGE}.detect_bag:main",
+            f"detection2d = {PACKAGE}.detection2d_node:main",
             f"detector = {PACKAGE}.detector_node:main",
             f"evaluate_detector = {PACKAGE}.evaluate_detector:main",
             f"fit_calibrator = {PACKAGE}.fit_calibrator:main",
