@@ -32,6 +32,8 @@ setup(
             f"save_map = {PACKAGE}.save_map_node:main",
             f"simulate = {PACKAGE}.simulate:main",
             f"tum_to_bag = {PACKAGE}.tum_to_bag:main",
+            f"visual_odometry = {PACKAGE}.visual_odometry_node:main",
+            f"visual_odometry_bag = {PACKAGE}.visual_odometry_bag:main",
         ],
     },
 )

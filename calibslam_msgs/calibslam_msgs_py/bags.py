@@ -220,6 +220,10 @@ class BagWriter:
         self.add_topic(topic, kind)
         self._writer.write(self._connections[topic], int(stamp), data)
 
+    def knows(self, kind: str) -> bool:
+        """Whether messages of this type can be written."""
+        return kind in self._store.fielddefs
+
     def add_topic(self, topic: str, kind: str) -> None:
         """Make a topic, also if no message follows.
 
@@ -228,7 +232,7 @@ class BagWriter:
         """
         connection = self._connections.get(topic)
         if connection is None:
-            if kind not in self._store.fielddefs:
+            if not self.knows(kind):
                 raise BagError(f"unknown message type {kind} for topic {topic}")
             self._connections[topic] = self._writer.add_connection(topic, kind, typestore=self._store)
         elif connection.msgtype != kind:
