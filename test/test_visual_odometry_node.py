@@ -28,7 +28,7 @@ def live() -> Iterator[tuple[Watcher, Process]]:
         Process(domain, "calibslam_sim", "visual_odometry", "--ros-args", "-p", "readout:=0.0") as process,
     ):
         watcher.listen(RelativePose, "/relative_pose", MEASUREMENT)
-        wait_until(lambda: watcher.counts("/visual_odometry"), lambda: f"no diagnostics; it says: {process.output}")
+        wait_until(lambda: watcher.sees("/visual_odometry"), lambda: f"it is not there; it says: {process.output}")
         yield watcher, process
 
 
