@@ -14,7 +14,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from rclpy.node import Node
-from rclpy.qos import qos_profile_services_default
 
 from calibslam_backend.diagnostics import of_session
 from calibslam_backend.estimator import EstimatorSettings
@@ -93,7 +92,7 @@ class BackendNode(Node):
             (Kind.CAMERA, "camera/camera_info", SENSOR),
             (Kind.MOTION, "relative_pose", MEASUREMENT_INPUT),
             (Kind.BOXES, "detections", MEASUREMENT_INPUT),
-            (Kind.START, "initialpose", qos_profile_services_default),
+            (Kind.START, "initialpose", MEASUREMENT_INPUT),
         ):
             # As bytes: what cannot be decoded would otherwise end the node, and the journal takes them as they are.
             subscribe(self, self._counters, TYPES[kind], topic, self._receiver(kind, topic), profile, raw=True)

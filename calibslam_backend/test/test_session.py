@@ -280,7 +280,7 @@ def test_boxes_of_another_camera_are_rejected() -> None:
 
 
 def test_innovations_of_a_true_world_are_what_they_should_be() -> None:
-    """A quarter of chi-squared with 4 degrees of freedom has a mean of 1; few boxes are needed to see a factor of two."""
+    """A quarter of chi-squared with 4 degrees of freedom has a mean of 1; a factor of two is seen with few boxes."""
     nis: list[float] = []
     for seed in range(4):
         session = live().use(list(replace(WORLD, seed=seed).measurements()))
