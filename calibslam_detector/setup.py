@@ -12,9 +12,9 @@ setup(
         ("share/ament_index/resource_index/packages", [f"resource/{PACKAGE}"]),
         (f"share/{PACKAGE}", ["package.xml"]),
     ],
-    package_data={PACKAGE: ["py.typed"]},
+    package_data={PACKAGE: ["py.typed", "default_weights/*"]},
     install_requires=["setuptools"],
-    zip_safe=True,
+    zip_safe=False,
     maintainer="CalibSLAM maintainers",
     maintainer_email="maintainers@calibslam.invalid",
     description="Boxes with calibrated covariances: a detector and its training, and a calibrator for any detector.",
@@ -22,6 +22,7 @@ setup(
     entry_points={
         "console_scripts": [
             f"calibrator = {PACKAGE}.calibrator_node:main",
+            f"detect_bag = {PACKAGE}.detect_bag:main",
             f"detector = {PACKAGE}.detector_node:main",
             f"evaluate_detector = {PACKAGE}.evaluate_detector:main",
             f"fit_calibrator = {PACKAGE}.fit_calibrator:main",

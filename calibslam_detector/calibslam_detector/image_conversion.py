@@ -32,6 +32,7 @@ DEPTH_ENCODINGS: dict[str, tuple[str, float]] = {
 }
 # What compressed_depth_image_transport writes before the PNG: the format and the two numbers of its quantisation.
 COMPRESSED_DEPTH_HEADER = 12  # bytes
+OVERLAY_QUALITY = 85  # of JPEG
 
 
 def decode_raw(data: np.ndarray, height: int, width: int, step: int, encoding: str) -> np.ndarray:
