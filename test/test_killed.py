@@ -56,6 +56,10 @@ class Robot:
         self._motions = node.create_publisher(RelativePose, "relative_pose", KEPT)
         self.sent = 0
 
+    def wait(self, process: Process) -> None:
+        """Until the back end listens."""
+        wait_until(lambda: self._camera.get_subscription_count() == 1, lambda: f"no back end: {process.output}")
+
     def drive(self, start: int = 0, end: int = 150) -> None:
         motions, boxes = WORLD.motions(), WORLD.boxes()
         for k in range(start, end):
@@ -92,7 +96,7 @@ def test_killed_at_random_moments(tmp_path: Path) -> None:
         driving = threading.Thread(target=robot.drive, daemon=True)
         process = backend(domain, tmp_path / "journal")
         try:
-            wait_until(lambda: watcher.sees("/backend"), "the back end does not start")
+            robot.wait(process)
             driving.start()
             for moment in moments:
                 wait_until(lambda m=moment: robot.sent >= m, "the robot does not move")
@@ -126,6 +130,7 @@ def test_a_full_disk_is_reported_and_the_graph_goes_on(tmp_path: Path) -> None:
     domain = random_domain()
     with Watcher(domain) as watcher, backend(domain, tmp_path / "journal") as process:
         robot = Robot(watcher)
+        robot.wait(process)
         robot.drive(0, 40)
         wait_until(lambda: watcher.counts("/backend").get("images") == "40", lambda: process.output)
         resource.prlimit(process.pid, resource.RLIMIT_FSIZE, ((tmp_path / "journal").stat().st_size + 3000,) * 2)
@@ -146,6 +151,7 @@ def test_the_map_is_saved_at_the_end_and_started_in_where_told(tmp_path: Path) -
         watcher.listen(PathMessage, "/trajectory")
         robot = Robot(watcher)
         with backend(domain, tmp_path / "journal", *inside, "-p", "save_at_exit:=end/map.json") as process:
+            robot.wait(process)
             robot.drive()
             wait_until(lambda: watcher.counts("/backend").get("images") == "150", lambda: process.output)
             assert process.end(signal.SIGTERM) == 0, process.output

@@ -112,8 +112,11 @@ def refuse_unknown_parameters(node: Node) -> None:
     """
     unknown = sorted(name for name in node._parameter_overrides if not node.has_parameter(name))
     if unknown:
-        valid = sorted(name for name in node._parameters if not name.startswith("start_type_description"))
-        raise SettingsError(f"{node.get_name()}: unknown parameter {', '.join(unknown)}; valid are: {', '.join(valid)}")
+        ours = sorted(name for name in node._parameters if not name.startswith(("start_type", "qos_overrides.")))
+        raise SettingsError(
+            f"{node.get_name()}: unknown parameter {', '.join(unknown)}; valid are: {', '.join(ours)}, and those that "
+            "`ros2 param list` shows as qos_overrides"
+        )
 
 
 class Counters:
@@ -131,6 +134,7 @@ class Counters:
 
     def __init__(self, node: Node, describe: Callable[[], Mapping[str, object]] | None = None) -> None:
         self._node, self._describe = node, describe
+        self._counting = threading.Lock()  # several threads may count
         self._counts: Counter[str] = Counter()
         self._values: dict[str, str] = {}
         self._published: Counter[str] = Counter()
@@ -141,7 +145,8 @@ class Counters:
 
     def count(self, name: str, by: int = 1) -> None:
         """Add to a counter."""
-        self._counts[name] += by
+        with self._counting:
+            self._counts[name] += by
 
     def reject(self, error: InvalidMeasurement, count: int = 1) -> None:
         """Count what is left out by its reason, and say so now and then."""
@@ -161,11 +166,13 @@ class Counters:
         return self._counts[name]
 
     def _publish(self) -> None:
-        growing = [name for name, count in sorted(self._counts.items()) if count > self._published[name]]
+        with self._counting:
+            counts = self._counts.copy()
+        growing = [name for name, count in sorted(counts.items()) if count > self._published[name]]
         errors = [name for name in growing if name.startswith(self.ERROR)]
         warnings = [name for name in growing if name.startswith(self.WARN)]
-        self._published = self._counts.copy()
-        values = {name: str(count) for name, count in sorted(self._counts.items())} | self._values
+        self._published = counts
+        values = {name: str(count) for name, count in sorted(counts.items())} | self._values
         for name, each in self._inputs.items():
             values |= {f"{name}_{key}": value for key, value in each.values().items()}
         if self._describe is not None:
