@@ -8,7 +8,7 @@ from __future__ import annotations
 import threading
 from collections import deque
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import IntEnum
 from typing import Protocol
 
@@ -91,7 +91,7 @@ class Intake:
             if len(self._queue) >= self._queue_size * (1 if event.kind == Kind.BOXES else 2):
                 raise InvalidMeasurement("queue_full", "measurements come faster than they can be used")
             self.write(event)
-            self._queue.append(event)
+            self._queue.append(event if self.journal is not None else replace(event, payload=b""))
             self._changed.notify()
 
     def wait(self, timeout: float) -> None:

@@ -21,7 +21,7 @@ import helpers_on_path  # noqa: F401
 import numpy as np
 from calibslam_msgs.srv import SaveMap
 from live import Watcher, random_domain, wait_until
-from live_graph import DATA, Player, backend, recording_of, truth_of
+from live_graph import ASK_FOR_KEPT, DATA, Player, backend, recording_of, truth_of
 
 from calibslam_backend.metrics import Trajectory, ate
 from calibslam_backend.object_map import ObjectMap
@@ -38,7 +38,8 @@ def run(recording: Recording, truth: Trajectory, moments: list[float], rate: flo
     measurements = list(recording.measurements())
     images = sum(isinstance(m, Boxes) for m in measurements)
     domain = random_domain()
-    parameters = (f"journal:={scratch / 'journal'}", f"map_folder:={scratch}", f"refine_after:={REFINE_AFTER}")
+    parameters = [f"journal:={scratch / 'journal'}", f"map_folder:={scratch}", f"refine_after:={REFINE_AFTER}"]
+    parameters += ASK_FOR_KEPT
     with Watcher(domain) as watcher:
         player = Player(watcher, recording.camera)
         process = backend(domain, *parameters)
@@ -64,7 +65,9 @@ def run(recording: Recording, truth: Trajectory, moments: list[float], rate: flo
             if not saved.success:
                 raise SystemExit(saved.message)
             counts = watcher.counts("/backend")
-            print("  ", {k: v for k, v in counts.items() if k.startswith(("rejected_r", "odometry", "errors", "lost"))})
+            shown = ("rejected_r", "rejected_o", "odometry", "errors", "lost", "journal")
+            print(f"  journal {(scratch / 'journal').stat().st_size / 1e6:.1f} MB,", end=" ")
+            print({name: count for name, count in counts.items() if name.startswith(shown)}, flush=True)
             process.end()
         finally:
             process.__exit__()

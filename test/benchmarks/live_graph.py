@@ -28,9 +28,7 @@ TICKS = os.sysconf("SC_CLK_TCK")
 # Publishers keep all of a recording for a back end that was away.
 KEPT = QoSProfile(depth=5000, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 ASK_FOR_KEPT = [
-    part
-    for topic in ("/detections", "/relative_pose")
-    for part in ("-p", f"qos_overrides.{topic}.subscription.durability:=transient_local")
+    f"qos_overrides.{topic}.subscription.durability:=transient_local" for topic in ("/detections", "/relative_pose")
 ]
 
 
@@ -98,7 +96,7 @@ class Player:
 def backend(domain: int, *parameters: str) -> Process:
     """A back end with these parameters, `name:=value`."""
     options = [part for parameter in parameters for part in ("-p", parameter)]
-    return Process(domain, "calibslam_backend", "backend", "--ros-args", *options, *ASK_FOR_KEPT)
+    return Process(domain, "calibslam_backend", "backend", "--ros-args", *options)
 
 
 def cpu_seconds(pid: int) -> float:

@@ -33,7 +33,7 @@ from calibslam_backend.quadric import Ellipsoid
 from calibslam_msgs_py.conversions import boxes_to_msg, camera_to_msg, motion_to_msg, stamp_to_msg
 from calibslam_msgs_py.measurements import SECOND
 
-LAP = 30.0  # [s]
+LAP = 60.0  # [s]
 GARBAGE_PERIOD = 0.5  # [s]
 LISTENER = """
 import sys, rclpy
