@@ -1,5 +1,7 @@
 """Installation of calibslam_backend; executables go to lib/calibslam_backend/ for `ros2 run`."""
 
+from glob import glob
+
 from setuptools import find_packages, setup
 
 PACKAGE = "calibslam_backend"
@@ -11,6 +13,9 @@ setup(
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{PACKAGE}"]),
         (f"share/{PACKAGE}", ["package.xml"]),
+        (f"share/{PACKAGE}/config", sorted(glob("config/*.yaml"))),
+        (f"share/{PACKAGE}/rviz", sorted(glob("rviz/*.rviz"))),
+        (f"share/{PACKAGE}/foxglove", sorted(glob("foxglove/*.json"))),
     ],
     package_data={PACKAGE: ["py.typed"]},
     install_requires=["setuptools"],

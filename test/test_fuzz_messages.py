@@ -13,9 +13,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from fuzzing import ends_within, examples
-from hypothesis import given
-from hypothesis import strategies as st
+from fuzzing import fuzz
 from mutations import spoilt_bytes, spoilt_message
 from rclpy.serialization import deserialize_message, serialize_message
 from valid_messages import VALID, WORLD, camera
@@ -32,7 +30,6 @@ from calibslam_msgs_py.measurements import Boxes, InvalidMeasurement, RelativeMo
 # Why a whole message is refused.
 REASONS = {"shape", "time", "pose", "covariance", "radii", "camera", "image_size", "encoding", "corrupt_image"}
 TYPES = c.RosTypes()
-randoms = st.randoms(use_true_random=False)
 
 
 def is_pose(T: np.ndarray) -> bool:
@@ -117,14 +114,7 @@ def test_valid_messages_are_used(kind: str) -> None:
 @pytest.mark.parametrize("kind", READERS)
 def test_spoilt_fields(kind: str) -> None:
     valid = VALID[kind](bags.types)
-
-    @examples(50, 1500)
-    @given(randoms)
-    def spoil(random: Random) -> None:
-        with ends_within(30.0):
-            used_or_refused(kind, spoilt_message(valid, random, lengths_too=True))
-
-    spoil()
+    fuzz(lambda random: used_or_refused(kind, spoilt_message(valid, random, lengths_too=True)), few=50, many=1500)
 
 
 @pytest.mark.parametrize("kind", READERS)
@@ -133,47 +123,40 @@ def test_spoilt_bytes(kind: str) -> None:
     valid = VALID[kind](TYPES)
     data, store = serialize_message(valid), calibslam_typestore()
 
-    @examples(50, 1500)
-    @given(randoms)
     def spoil(random: Random) -> None:
         spoilt = spoilt_bytes(data, random)
-        with ends_within(30.0):
-            # That of ROS raises its own errors, that of bags whatever its generated code does: `bags` counts both.
-            for decode in (
-                lambda: deserialize_message(spoilt, type(valid)),
-                lambda: store.deserialize_cdr(spoilt, kind),
-            ):
-                try:
-                    message = decode()
-                except Exception:
-                    continue
-                used_or_refused(kind, message)
-
-    spoil()
-
-
-@examples(4, 150)
-@given(randoms)
-def test_the_estimator_among_spoilt_messages(random: Random) -> None:
-    """What passes the checks of a message may still be nonsense: it must not make the estimate unusable."""
-    estimator = Estimator(c.camera_from_msg(camera(TYPES)), np.eye(4), EstimatorSettings())
-    with ends_within(120.0):
-        for measured in WORLD.measurements():
-            message = (
-                c.boxes_to_msg(measured, TYPES) if isinstance(measured, Boxes) else c.motion_to_msg(measured, TYPES)
-            )
-            if random.random() < 0.2:
-                message = spoilt_message(message, random, lengths_too=False)
+        # That of ROS raises its own errors, that of bags whatever its generated code does: `bags` counts both.
+        for decode in (lambda: deserialize_message(spoilt, type(valid)), lambda: store.deserialize_cdr(spoilt, kind)):
             try:
-                read: Boxes | RelativeMotion
-                if isinstance(measured, Boxes):
-                    read, _ = c.valid_boxes(c.boxes_from_msg(message))
-                else:
-                    read = c.motion_from_msg(message)
-                estimator.add(read)
-            except InvalidMeasurement as error:
-                assert error.reason
-        estimator.finish()
+                message = decode()
+            except Exception:
+                continue
+            used_or_refused(kind, message)
+
+    fuzz(spoil, few=50, many=1500)
+
+
+def test_the_estimator_among_spoilt_messages() -> None:
+    """What passes the checks of a message may still be nonsense: it must not make the estimate unusable."""
+    fuzz(drive_among_spoilt_messages, few=4, many=300, seconds=120.0)
+
+
+def drive_among_spoilt_messages(random: Random) -> None:
+    estimator = Estimator(c.camera_from_msg(camera(TYPES)), np.eye(4), EstimatorSettings())
+    for measured in WORLD.measurements():
+        message = c.boxes_to_msg(measured, TYPES) if isinstance(measured, Boxes) else c.motion_to_msg(measured, TYPES)
+        if random.random() < 0.2:
+            message = spoilt_message(message, random, lengths_too=False)
+        try:
+            read: Boxes | RelativeMotion
+            if isinstance(measured, Boxes):
+                read, _ = c.valid_boxes(c.boxes_from_msg(message))
+            else:
+                read = c.motion_from_msg(message)
+            estimator.add(read)
+        except InvalidMeasurement as error:
+            assert error.reason
+    estimator.finish()
     if estimator.stamps:
         assert np.isfinite(estimator.trajectory()).all()
         assert all(np.isfinite(q.radii).all() and is_pose(q.T_map_object) for q in estimator.quadrics())

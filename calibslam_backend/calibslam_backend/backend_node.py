@@ -32,10 +32,10 @@ from calibslam_msgs_py.measurements import Boxes, InvalidMeasurement, RelativeMo
 from calibslam_msgs_py.node import (
     LATCHED,
     MEASUREMENT_INPUT,
-    QOS_OVERRIDES,
     SECONDS_BETWEEN_WARNINGS,
     SENSOR,
     Counters,
+    advertise,
     run,
     subscribe,
 )
@@ -75,8 +75,7 @@ class BackendNode(Node):
         self._types = RosTypes()
         self._counters = Counters(self, lambda: of_session(self._session))
         self._map_publishers = {
-            topic: self.create_publisher(self._types(kind), topic, LATCHED, qos_overriding_options=QOS_OVERRIDES)
-            for topic, kind in TOPICS.items()
+            topic: advertise(self, self._types(kind), topic, LATCHED) for topic, kind in TOPICS.items()
         }
         self._map_to_odom = MapToOdom(self, settings.map_frame)
         load_kernels()  # before anything can come in and wait

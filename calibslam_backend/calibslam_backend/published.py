@@ -15,6 +15,7 @@ from calibslam_msgs_py.conversions import (
     pose_to_msg,
     pose_with_covariance_to_msg,
     quadrics_to_msg,
+    transform_to_msg,
 )
 from calibslam_msgs_py.measurements import Array, QuadricEstimate, StampedPose
 
@@ -27,6 +28,9 @@ TOPICS = {
     MARKERS: "visualization_msgs/msg/MarkerArray",
 }
 
+# In `run.mcap` only: there is no odometry frame between. Live, map -> odom is published (see map_to_odom_node).
+TRANSFORM = "tf"
+
 # visualization_msgs/Marker
 SPHERE, TEXT, ADD, DELETE_ALL = 2, 9, 0, 3
 
@@ -36,6 +40,12 @@ def pose_message(estimator: Estimator, types: MessageTypes, frame: str = MAP) ->
     k = len(estimator.stamps) - 1
     pose = StampedPose(estimator.stamps[k], estimator.pose(k))
     return pose_with_covariance_to_msg(pose, estimator.pose_covariance(k), frame, types)
+
+
+def camera_transform_message(estimator: Estimator, camera_frame: str, types: MessageTypes) -> Any:
+    """The newest keyframe as the transform map -> camera, so that what the camera sees can be shown in the map."""
+    k = len(estimator.stamps) - 1
+    return transform_to_msg(StampedPose(estimator.stamps[k], estimator.pose(k)), MAP, camera_frame or "camera", types)
 
 
 def map_messages(estimator: Estimator, types: MessageTypes, frame: str = MAP) -> Iterator[tuple[str, Any]]:

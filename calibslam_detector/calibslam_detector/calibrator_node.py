@@ -17,7 +17,7 @@ from rclpy.node import Node
 from calibslam_detector.calibrator import CalibratorError, load
 from calibslam_msgs_py.conversions import RosTypes, boxes_from_msg, boxes_to_msg, valid_boxes
 from calibslam_msgs_py.measurements import InvalidMeasurement
-from calibslam_msgs_py.node import MEASUREMENT, MEASUREMENT_INPUT, QOS_OVERRIDES, Counters, run, subscribe
+from calibslam_msgs_py.node import MEASUREMENT, MEASUREMENT_INPUT, Counters, advertise, run, subscribe
 from calibslam_msgs_py.settings import Settings, SettingsError, declare_parameters, setting
 
 
@@ -40,9 +40,7 @@ class CalibratorNode(Node):
             raise SettingsError(str(error)) from error
         self._types = RosTypes()
         self._counters = Counters(self)
-        self._publisher = self.create_publisher(
-            BoundingBoxArray, "detections", MEASUREMENT, qos_overriding_options=QOS_OVERRIDES
-        )
+        self._publisher = advertise(self, BoundingBoxArray, "detections", MEASUREMENT)
         subscribe(self, self._counters, BoundingBoxArray, "detections_raw", self._receive, MEASUREMENT_INPUT)
 
     def _receive(self, message: Any) -> None:

@@ -8,6 +8,7 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
+from copy import copy
 from typing import Any
 
 import rclpy
@@ -214,6 +215,12 @@ class _Input:
         }
 
 
+def advertise(node: Node, kind: Any, topic: str, profile: QoSProfile) -> Any:
+    """A publisher whose quality of service can be overridden by parameters."""
+    # A copy: rclpy writes the overrides into the profile itself.
+    return node.create_publisher(kind, topic, copy(profile), qos_overriding_options=QOS_OVERRIDES)
+
+
 def subscribe(
     node: Node,
     counters: Counters,
@@ -238,7 +245,7 @@ def subscribe(
         kind,
         topic,
         receive,
-        profile,
+        copy(profile),
         raw=raw,
         qos_overriding_options=QOS_OVERRIDES,
         event_callbacks=SubscriptionEventCallbacks(message_lost=lost),

@@ -25,7 +25,7 @@ from calibslam_msgs_py.conversions import (
     stamped_pose_from_msg,
 )
 from calibslam_msgs_py.measurements import InvalidMeasurement, RelativeMotion
-from calibslam_msgs_py.node import MEASUREMENT, MEASUREMENT_INPUT, QOS_OVERRIDES, Counters, run, subscribe
+from calibslam_msgs_py.node import MEASUREMENT, MEASUREMENT_INPUT, Counters, advertise, run, subscribe
 from calibslam_msgs_py.settings import Settings, SettingsError, declare_parameters, setting
 from calibslam_sim.odometry_noise import OdometryNoise, add_noise
 from calibslam_sim.random_streams import stream
@@ -66,9 +66,7 @@ class OdometryNode(Node):
         self._differencer = OdometryDifferencer()
         self._types = RosTypes()
         self._counters = Counters(self)
-        self._publisher = self.create_publisher(
-            RelativePose, "relative_pose", MEASUREMENT, qos_overriding_options=QOS_OVERRIDES
-        )
+        self._publisher = advertise(self, RelativePose, "relative_pose", MEASUREMENT)
         if settings.source == "odom":
             subscribe(self, self._counters, Odometry, "odom", self._receive_odometry, MEASUREMENT_INPUT)
         else:

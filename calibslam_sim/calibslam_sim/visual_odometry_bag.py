@@ -89,7 +89,7 @@ def odometry(bag: BagReader, image: str, depth: str, camera: DepthCamera) -> Res
 def write(bag: BagReader, out: Path, result: Result, overwrite: bool) -> list[str]:
     """The bag with the motions; returns the topics that could not be copied."""
     with BagWriter(out, overwrite) as writer:
-        known = [topic for topic, kind in bag.topics.items() if topic != MOTIONS and writer.knows(kind)]
+        known = [topic for topic in writer.adopt(bag) if topic != MOTIONS]
         motions = iter(result.steps)
         due = next(motions, None)
         for topic, stamp, data in bag.raw_messages(known):
