@@ -20,6 +20,7 @@ from calibslam_backend.estimator import EstimatorSettings
 from calibslam_backend.noise import CALIBRATED as OWN_COVARIANCE
 from calibslam_backend.noise import FIXED, QUADRICSLAM
 from calibslam_detector.image_conversion import decode_compressed
+from calibslam_detector.weights_file import SHIPPED
 from calibslam_msgs_py.conversions import valid_boxes
 from calibslam_msgs_py.measurements import Boxes
 from calibslam_msgs_py.settings import setting
@@ -27,7 +28,6 @@ from calibslam_sim.experiments.covariance_heads import CovarianceHeads
 from calibslam_sim.experiments.design import (
     CALIBRATED,
     Experiment,
-    ExperimentError,
     ExperimentSettings,
     Metrics,
     Seed,
@@ -53,7 +53,7 @@ NOISE = {
 class ImageSettings(ExperimentSettings):
     """The recordings, and the detectors."""
 
-    weights: str = setting("", "file of the detector with covariances trained by f-Cal")
+    weights: str = setting("", "file of the detector with covariances trained by f-Cal; empty: the shipped one")
     nll_weights: str = setting("", "file of the same detector with covariances trained by NLL; empty: left out")
     duration: float = setting(20.0, "length of a recording", unit="s", low=1.0)
     frame_rate: float = setting(30.0, "odometry steps per second", unit="Hz", low=1.0)
@@ -101,14 +101,9 @@ def heads(weights: str, nll_weights: str) -> CovarianceHeads:
     """The detectors of these files.
 
     Raises:
-        ExperimentError: they cannot be used, or one is not given.
+        ExperimentError: they cannot be used.
     """
-    if not weights:
-        raise ExperimentError(
-            "--weights FILE: a detector that `./calibslam run calibslam_detector train --stage covariance "
-            "--loss f_cal_kl` wrote; see docs/detector.md"
-        )
-    files = {CALIBRATED: Path(weights)} | ({NLL: Path(nll_weights)} if nll_weights else {})
+    files = {CALIBRATED: Path(weights) if weights else SHIPPED} | ({NLL: Path(nll_weights)} if nll_weights else {})
     return CovarianceHeads(files)
 
 
