@@ -6,7 +6,8 @@ Three families of conditions:
     real_given_...: real visual odometry, identities given;
     real_estimated_...: real visual odometry and nothing else.
 Two more, real_given_underconfident and real_given_scale_4, believe calibrated deviations to be 2 and 4 times as large:
-if errors are alike from image to image, what is right for each box is too confident for a row of them. With real odometry each repetition leaves out another tenth of the images: their spread tells how far a result hangs
+if errors are alike from image to image, what is right for each box is too confident for a row of them.
+With real odometry each repetition leaves out another tenth of the images: their spread tells how far a result hangs
 on single images, not how it would be on other recordings.
 """
 
