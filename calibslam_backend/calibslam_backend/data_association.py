@@ -31,7 +31,7 @@ from calibslam_backend.initialisation import initialise
 from calibslam_backend.localisation import localise
 from calibslam_backend.noise import NoiseModel, spread
 from calibslam_backend.relocalisation import Relocalised, relocalise
-from calibslam_backend.revision import revise
+from calibslam_backend.revision import Revision
 from calibslam_backend.tracking import overlap
 from calibslam_msgs_py.measurements import Array, Boxes, Camera
 
@@ -290,12 +290,20 @@ class DataAssociation:
         """
         if self.settings.association == GIVEN:
             return 0
-        ids = [j for j in self._graph.landmarks if self._graph.is_solved(j)]
+        ids = list(self._graph.landmarks)
         if not ids:
             return 0
-        quadrics = np.stack([self._graph.quadric(j) for j in ids])
+        revision = Revision(
+            np.stack([self._graph.quadric(j) for j in ids]),
+            ids,
+            [self.classes[j] for j in ids],
+            self.camera.K,
+            (self.camera.width, self.camera.height),
+            self.settings,
+        )
         turn = range(len(self.frames)) if number is None else self._next_settled(number)
-        changed = sum(self._revise_frame(k, ids, quadrics) for k in turn)
+        given: dict[int, Counter[int]] = {}
+        changed = sum(self._revise_frame(k, revision, given) for k in turn)
         for j in [j for j in ids if j not in self._known and len(self._graph.landmarks[j].boxes) < self.LEAST_BOXES]:
             self._graph.remove_quadric(j)
             self._forget(j)
@@ -311,26 +319,16 @@ class DataAssociation:
             self._revised = (turn[-1] + 1) % settled
         return turn
 
-    def _revise_frame(self, k: int, ids: list[int], quadrics: Array) -> int:
+    def _revise_frame(self, k: int, revision: Revision, given: dict[int, Counter[int]]) -> int:
+        """Returns how many boxes changed hands; `given` keeps `_given_to` of tracks while none does."""
         frame = self.frames[k]
         if not frame.boxes:
             return 0
-        by_track = [
-            Counter(j for i, m in self._candidates[t].seen if (j := self.frames[i].quadrics[m]) is not None)
-            for t in frame.tracks
-        ]
-        revised = revise(
-            self._graph.pose(k),
-            frame.arrays,
-            frame.classes,
-            by_track,
-            quadrics,
-            ids,
-            [self.classes[j] for j in ids],
-            self.camera.K,
-            (self.camera.width, self.camera.height),
-            self.settings,
-        )
+        for track in frame.tracks:
+            if track not in given:
+                given[track] = self._given_to(self._candidates[track])
+        by_track = [given[track] for track in frame.tracks]
+        revised = revision.judge(self._graph.pose(k), frame.arrays, frame.classes, by_track)
         changed = [n for n, (old, new) in enumerate(zip(frame.quadrics, revised, strict=True)) if old != new]
         for n in changed:
             self._take(k, n)
@@ -339,12 +337,14 @@ class DataAssociation:
                 self._give(k, n, j)
         for n in changed:
             self._rebind(frame.tracks[n])
+        if changed:
+            given.clear()
         return len(changed)
 
     def _rebind(self, track: int) -> None:
         """A track belongs to the quadric that most of its boxes are given to."""
         candidate = self._candidates[track]
-        given = Counter(j for k, n in candidate.seen if (j := self.frames[k].quadrics[n]) is not None)
+        given = self._given_to(candidate)
         if given:
             j, number = given.most_common(1)[0]
             if number >= self.settings.votes and 2 * number > len(candidate.seen):
@@ -442,6 +442,10 @@ class DataAssociation:
         self._graph.remove_quadric(j)
         del self.classes[j]
         self.counts["merged"] += 1
+
+    def _given_to(self, candidate: Candidate) -> Counter[int]:
+        """How many boxes of a track are given to which quadrics."""
+        return Counter(j for k, n in candidate.seen if (j := self.frames[k].quadrics[n]) is not None)
 
     def _open_rows(self, candidate: Candidate) -> list[tuple[int, int]]:
         """Boxes of a track, (keyframe, row), that are given to no quadric."""

@@ -15,6 +15,7 @@ from __future__ import annotations
 import time
 from bisect import insort
 from collections import Counter
+from collections.abc import Callable, Set
 from dataclasses import dataclass
 
 import gtsam
@@ -52,7 +53,7 @@ class Keyframe:
         stamp: of its image [ns].
         T_map_camera: (4, 4) as known right after it.
         boxes: boxes that were given to quadrics.
-        added, removed: ids of quadrics.
+        added, removed: ids of quadrics, since the keyframe before.
         repaired: what had to be repaired; "" if nothing.
         seconds: that it took.
     """
@@ -72,7 +73,9 @@ class Estimator:
 
     SIGHTINGS_APART = SECOND // 5
     SIGHTINGS_AGREE = 0.2  # [rad, m]
-    ROUNDS = 5  # of association and optimisation at the end
+    PIECES = 4  # in which earlier keyframes are revised
+    # At the end: rounds of association and optimisation, and when poses [rad, m] count as settled.
+    ROUNDS, ITERATIONS_OF_A_ROUND, ITERATIONS, CONVERGED = 5, 2, 10, 1e-3
 
     def __init__(self, camera: Camera, T_body_camera: Array, settings: EstimatorSettings) -> None:
         load_kernels()
@@ -89,6 +92,8 @@ class Estimator:
         self._tracker = Tracker(self.settings, self.camera.K)
         self._graph = ObjectGraph(self.camera.K, self.settings, self.settings, self.settings)
         self._objects = DataAssociation(self._graph, self.camera, self.settings, self.counts)
+        self._known: Set[int] = set()  # quadrics after the last keyframe
+        self._chores: list[Callable[[], object]] = []
         self._searching = False
         self._sighting: tuple[int, Array] | None = None  # where a camera that searches was seen last
         self._given: dict[str, int] = {}
@@ -141,24 +146,24 @@ class Estimator:
         """Images for which odometry has not come yet."""
         return len(self._waiting)
 
-    def finish(self, iterations: int = 10) -> None:
-        """Relinearise until nothing moves any more: the best estimate of all that was seen."""
+    def finish(self) -> None:
+        """Associate and relinearise until nothing changes any more: the best estimate of all that was seen."""
         if not self.stamps:
             return
         for _ in range(self.ROUNDS):
             changed = self._objects.revise()
             self._objects.start_leftovers()
-            self._converge(iterations)
+            self._converge(self.ITERATIONS_OF_A_ROUND)
             self._objects.merge()
             if not changed:
                 break
-        self._converge(iterations)
+        self._converge(self.ITERATIONS)
 
     def _converge(self, iterations: int) -> None:
         for _ in range(iterations):
             before = self._graph.poses()
-            self._objects.note(self._graph.update(everything=True))
-            if np.abs(self._graph.poses() - before).max() < 1e-4:
+            self._objects.note(self._graph.iterate())
+            if np.abs(self._graph.poses() - before).max() < self.CONVERGED:
                 break
 
     # -- estimate out -------------------------------------------------------------------------------------------
@@ -288,6 +293,8 @@ class Estimator:
                 *self._motions.between(*interval), self._motions.drifts(*interval), self._motions.measured(*interval)
             )
             if not self._moved(motion.T, boxes.stamp - self.stamps[-1]):
+                if self._chores:
+                    self._chores.pop(0)()
                 return None
         return self._keyframe(boxes, tracks, motion, found, began)
 
@@ -337,9 +344,25 @@ class Estimator:
         self._searching = False
         return found
 
+    def _chores_of(self, k: int) -> list[Callable[[], object]]:
+        """What keyframe k leaves to be done: each a piece of work for one image."""
+        objects, settings = self._objects, self.settings
+        chores: list[Callable[[], object]] = [lambda: objects.relocalise(k)] if k else []
+        chores.append(lambda: objects.start_quadrics(objects.frames[k].tracks))
+        chores += [lambda: objects.revise(-(-settings.revised // self.PIECES))] * self.PIECES
+        return [*chores, self._settle]
+
+    def _settle(self) -> None:
+        report = self._graph.settle()
+        if report is not None:
+            self._objects.note(report)
+
     def _keyframe(
         self, boxes: Boxes, tracks: list[int], motion: Motion | None, found: Relocalised | None, began: float
     ) -> Keyframe:
+        for chore in self._chores:
+            chore()
+        before = self._known
         objects = self._objects
         frame = objects.frame(boxes, tracks)
         k = len(self.stamps)
@@ -355,19 +378,18 @@ class Estimator:
             objects.bind_found(frame, found)
         if motion is not None:
             objects.vote(k, motion.covariance)
-            objects.relocalise(k)
-        added = objects.start_quadrics(tracks)
         report = self._graph.update()
         self._objects.note(report)
-        removed = report.removed + objects.merge()
-        objects.revise(self.settings.revised)
+        objects.merge()
+        self._chores = self._chores_of(k)
+        self._known = set(self._graph.landmarks)
         return Keyframe(
             k,
             boxes.stamp,
             self._graph.pose(k),
             used,
-            added,
-            removed,
+            sorted(self._known - before),
+            sorted(before - self._known),
             report.repaired,
             time.perf_counter() - began,
         )

@@ -23,7 +23,7 @@ from calibslam_msgs_py.bags import BagError, BagReader, BagWriter
 from calibslam_msgs_py.measurements import SECOND, Boxes, InvalidMeasurement
 from calibslam_msgs_py.settings import SettingsError, add_arguments, from_arguments
 
-MAP_PERIOD = 1.0  # [s] of recorded time between two maps in run.mcap
+MAP_PERIOD = 2.0  # [s] of recorded time between two maps in run.mcap
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
