@@ -1,5 +1,7 @@
 """Installation of calibslam_backend; executables go to lib/calibslam_backend/ for `ros2 run`."""
 
+from glob import glob
+
 from setuptools import find_packages, setup
 
 PACKAGE = "calibslam_backend"
@@ -11,6 +13,7 @@ setup(
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{PACKAGE}"]),
         (f"share/{PACKAGE}", ["package.xml"]),
+        (f"share/{PACKAGE}/config", sorted(glob("config/*.yaml"))),
     ],
     package_data={PACKAGE: ["py.typed"]},
     install_requires=["setuptools"],

@@ -1,5 +1,7 @@
 """Installation of calibslam_sim; executables go to lib/calibslam_sim/ for `ros2 run`."""
 
+from glob import glob
+
 from setuptools import find_packages, setup
 
 PACKAGE = "calibslam_sim"
@@ -11,6 +13,7 @@ setup(
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{PACKAGE}"]),
         (f"share/{PACKAGE}", ["package.xml"]),
+        (f"share/{PACKAGE}/config", sorted(glob("config/*.yaml"))),
     ],
     package_data={PACKAGE: ["py.typed"]},
     install_requires=["setuptools"],
@@ -25,6 +28,7 @@ setup(
             f"evaluate = {PACKAGE}.evaluate:main",
             f"experiment = {PACKAGE}.experiment:main",
             f"odometry = {PACKAGE}.odometry_node:main",
+            f"parameters = {PACKAGE}.parameters:main",
             f"play = {PACKAGE}.play_node:main",
             f"record = {PACKAGE}.record_node:main",
             f"render_dataset = {PACKAGE}.render_dataset:main",
@@ -32,6 +36,8 @@ setup(
             f"save_map = {PACKAGE}.save_map_node:main",
             f"simulate = {PACKAGE}.simulate:main",
             f"tum_to_bag = {PACKAGE}.tum_to_bag:main",
+            f"visual_odometry = {PACKAGE}.visual_odometry_node:main",
+            f"visual_odometry_bag = {PACKAGE}.visual_odometry_bag:main",
         ],
     },
 )

@@ -96,12 +96,12 @@ def alignment(estimate: Trajectory, truth: Trajectory) -> Array:
 def interpolated(truth: Trajectory, stamps: Array) -> tuple[Array, Array]:
     """Which of the times (N,) [ns] the truth covers, and its poses (M, 4, 4) at those.
 
-    A time is covered between two poses that are at most twice `MAX_STAMP_DIFFERENCE` apart.
+    A time is covered between two poses if the nearer one is at most `MAX_STAMP_DIFFERENCE` away.
     """
     times, at = np.asarray(truth.stamps), np.asarray(stamps)
     after = np.clip(np.searchsorted(times, at), 1, len(times) - 1)
-    gap = times[after] - times[after - 1]
-    covered = (at >= times[0]) & (at <= times[-1]) & (gap <= 2 * MAX_STAMP_DIFFERENCE * 1e9)
+    distance = np.minimum(np.abs(at - times[after - 1]), np.abs(times[after] - at))
+    covered = (at >= times[0]) & (at <= times[-1]) & (distance <= MAX_STAMP_DIFFERENCE * 1e9)
     seconds, wanted = (times - times[0]) * 1e-9, (at[covered] - times[0]) * 1e-9
     poses = np.tile(np.eye(4), (len(wanted), 1, 1))
     if len(wanted):

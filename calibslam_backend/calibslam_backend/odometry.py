@@ -35,6 +35,9 @@ class MotionNoise(Settings):
         0.003, "unknown odometry noise: constant drift in translation", unit="m/s", low=1e-9
     )
 
+    max_speed: float = setting(
+        100.0, "speed that a body can have: a faster motion is a failure of odometry", unit="m/s", low=0.1
+    )
     max_acceleration: float = setting(
         30.0, "change of velocity from one motion to the next that a body can do: 3 g", unit="m/s^2", low=0.1
     )
@@ -51,12 +54,17 @@ class MotionNoise(Settings):
             covariance: (6, 6) of the later motion, if known: what it explains is plausible as well.
         """
         seconds = max(seconds, SHORTEST)
-        noise = np.zeros(6) if covariance is None else EXPLAINED * np.sqrt(2.0 * np.diag(covariance)) / seconds
+        noise = np.sqrt(2.0) * _explained(covariance, seconds)
         change = velocity - before
         return bool(
             np.linalg.norm(change[:3]) < self.max_angular_acceleration * seconds + np.linalg.norm(noise[:3])
             and np.linalg.norm(change[3:]) < self.max_acceleration * seconds + np.linalg.norm(noise[3:])
         )
+
+    def is_possible(self, velocity: Array, seconds: float, covariance: Array | None) -> bool:
+        """Whether a body can be as fast as this; arguments as of `is_plausible`."""
+        noise = _explained(covariance, max(seconds, SHORTEST))
+        return bool(np.linalg.norm(velocity[3:]) < self.max_speed + np.linalg.norm(noise[3:]))
 
     def covariance(self, T_start_end: Array) -> Array:
         """(6, 6) [rotation, translation] for a motion (4, 4)."""
@@ -64,6 +72,11 @@ class MotionNoise(Settings):
         rotation = np.hypot(self.rotation_floor, self.rotation_share * np.linalg.norm(motion[:3]))
         translation = np.hypot(self.translation_floor, self.translation_share * np.linalg.norm(motion[3:]))
         return np.diag(np.repeat([rotation, translation], 3) ** 2)
+
+
+def _explained(covariance: Array | None, seconds: float) -> Array:
+    """(6,) error of a velocity that the covariance (6, 6) of its motion explains."""
+    return np.zeros(6) if covariance is None else EXPLAINED * np.sqrt(np.diag(covariance)) / seconds
 
 
 class OdometryDifferencer:
@@ -130,11 +143,14 @@ class MotionChain:
     Times inside a step are interpolated along the geodesic, its covariance in proportion.
 
     A step that no body can make, by its change of velocity both from the last possible step and from the one just
-    before, is a failure of odometry: the body is then taken to go on as it did, and to do unseen what it may.
+    before, or by its speed, is a failure of odometry: the body is then taken to go on as it did, and to do unseen what
+    it may.
     """
 
     # What a body may do unseen, while odometry is missing or fails: 1 rad/s and 1 m/s more or less.
     UNSEEN_MOTION = 1.0
+    # A standard deviation [rad, m] of one step that says: not measured.
+    OPEN = 1.0
 
     def __init__(self, noise: MotionNoise, T_body_camera: Array) -> None:
         self._noise = noise
@@ -192,14 +208,31 @@ class MotionChain:
         step = self._extrinsic.inverse() * gtsam.Pose3(motion.T_start_end) * self._extrinsic
         velocity = gtsam.Pose3.Logmap(step) / seconds
         near = [self._noise.is_plausible(velocity, before, seconds, covariance) for before in self._velocities]
-        if any(near) or not near:
+        if (any(near) or not near) and self._noise.is_possible(velocity, seconds, covariance):
             self._velocities = [velocity, velocity]
-            self._append(motion.end, step, step, covariance, 0.0)
+            closed = None if covariance is None else self._closed(covariance, seconds)
+            self._append(motion.end, step, step, closed, 0.0)
             return problem
-        self._velocities[1] = velocity
-        coasting = gtsam.Pose3.Expmap(self._velocities[0] * seconds)
+        coasting = gtsam.Pose3()
+        if self._velocities:
+            self._velocities[1] = velocity
+            coasting = gtsam.Pose3.Expmap(self._velocities[0] * seconds)
         self._append(motion.end, coasting, step, covariance, self.UNSEEN_MOTION * seconds)
         return "odometry_implausible"
+
+    def _closed(self, covariance: Array, seconds: float) -> Array:
+        """A covariance (6, 6) with the directions that odometry leaves open bounded by what a body does unseen.
+
+        A robot in a plane states variances of 1e6 and more for height, roll and pitch. Taken at their word they let
+        the estimate fall into solutions upside down.
+        """
+        if np.diag(covariance).max() <= self.OPEN**2:
+            return covariance
+        variances, axes = np.linalg.eigh(covariance)
+        unseen = (self.UNSEEN_MOTION * max(seconds, SHORTEST)) ** 2
+        return np.asarray(
+            (axes * np.where(variances > self.OPEN**2, np.minimum(variances, unseen), variances)) @ axes.T
+        )
 
     def between(self, start: int, end: int) -> tuple[Array, Array]:
         """Motion (4, 4) of the camera and its covariance (6, 6) [rotation, translation] from start to end [ns].

@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from importlib.metadata import entry_points
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -22,6 +23,7 @@ from calibslam_msgs_py.conversions import (
     stamped_pose_from_msg,
     valid_boxes,
 )
+from calibslam_msgs_py.detection_conversions import DETECTIONS_2D, boxes_from_detections_2d
 from calibslam_msgs_py.measurements import Boxes, Camera, InvalidMeasurement, RelativeMotion
 
 log = logging.getLogger(__name__)
@@ -73,19 +75,20 @@ class Recording:
             BagError: it cannot be read, or misses a topic; the text says which and what is there.
         """
         with BagReader(path) as bag:
-            boxes = BOXES if BOXES in bag.topics else RAW_BOXES
+            foreign = [topic for topic, kind in bag.topics.items() if kind == DETECTIONS_2D]
+            sources = [topic for topic in (BOXES, RAW_BOXES) if topic in bag.topics] or foreign
+            if len(foreign) > 1 and sources == foreign:
+                raise BagError(f"{path} has boxes on {' and '.join(foreign)}: keep one of these topics only")
             motions = MOTIONS if MOTIONS in bag.topics else ODOMETRY
-            missing = [
-                " or ".join(names)
-                for names in ((BOXES, RAW_BOXES), (MOTIONS, ODOMETRY), (CAMERA,))
-                if not any(name in bag.topics for name in names)
-            ]
+            wanted = {f"{BOXES} or {RAW_BOXES} or any of {DETECTIONS_2D}": bool(sources)}
+            wanted |= {f"{MOTIONS} or {ODOMETRY}": motions in bag.topics, CAMERA: CAMERA in bag.topics}
+            missing = [names for names, there in wanted.items() if not there]
             if missing:
                 there = ", ".join(f"{name} ({bag.counts[name]})" for name in bag.topics) or "nothing"
                 raise BagError(f"{path} has no topic {' and no topic '.join(missing)}; it has: {there}")
             camera = cls._camera(bag)
-        model = load_calibrator(calibrator) if boxes == RAW_BOXES or calibrator else None
-        return cls(Path(path), camera, Counter(), {"boxes": boxes, "motions": motions}, model)
+        model = load_calibrator(calibrator) if sources[0] != BOXES or calibrator else None
+        return cls(Path(path), camera, Counter(), {"boxes": sources[0], "motions": motions}, model)
 
     @staticmethod
     def _camera(bag: BagReader) -> Camera:
@@ -104,8 +107,7 @@ class Recording:
             for topic, _, message in bag.messages([boxes, motions]):
                 try:
                     if topic == boxes:
-                        measured, dropped = valid_boxes(boxes_from_msg(message))
-                        self.rejected.update({f"box_{reason}": n for reason, n in dropped.items()})
+                        measured = self._boxes(message, bag.topics[topic])
                         yield self._calibrator(measured) if self._calibrator else measured
                     elif topic == MOTIONS:
                         yield motion_from_msg(message)
@@ -117,6 +119,16 @@ class Recording:
                 except InvalidMeasurement as error:
                     self.reject(error)
             self.rejected.update({f"undecodable{topic}": n for topic, n in bag.rejected.items()})
+
+    def _boxes(self, message: Any, kind: str) -> Boxes:
+        """The usable boxes of one image; the others are counted."""
+        if kind == DETECTIONS_2D:
+            found, left_out = boxes_from_detections_2d(message, self.camera)
+        else:
+            found, left_out = boxes_from_msg(message), {}
+        boxes, dropped = valid_boxes(found)
+        self.rejected.update({f"box_{reason}": n for reason, n in {**left_out, **dropped}.items()})
+        return boxes
 
     def reject(self, error: InvalidMeasurement) -> None:
         """Count a measurement that cannot be used, and say the first of each kind."""

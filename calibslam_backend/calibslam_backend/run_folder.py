@@ -29,6 +29,8 @@ class RunRecord:
         rejected: why, and other counts.
         associations: quadric and true identity of each box of a keyframe.
         wall_s, sequence_s: duration of the run and of the recording.
+        recording: absolute path of the bag.
+        calibrator: file that gave boxes their covariances; None: the default, or the boxes had them.
         settings: that were used, for the record.
     """
 
@@ -41,6 +43,8 @@ class RunRecord:
     associations: Sequence[tuple[int | None, str]]
     wall_s: float
     sequence_s: float
+    recording: str = ""
+    calibrator: str | None = None
     settings: dict[str, Any] = field(default_factory=dict)
 
 
@@ -84,6 +88,8 @@ def metrics_of(result: ObjectMap, record: RunRecord, truth: Trajectory | None) -
         "sequence_s": record.sequence_s,
         "peak_rss_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0,
         **({"association": vars(scores)} if scores else {}),
+        "recording": record.recording,
+        "calibrator": record.calibrator,
         "settings": record.settings,
     }
 

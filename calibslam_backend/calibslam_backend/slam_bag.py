@@ -113,6 +113,8 @@ def slam_bag(
     record = run_record(
         estimator, keyframes, dict(+recording.rejected), time.perf_counter() - began, (last - first) / SECOND
     )
+    record.recording = str(Path(bag).resolve())
+    record.calibrator = None if calibrator is None else str(Path(calibrator).resolve())
     return write_run(out, Path(bag).name, estimator.object_map(), record, recording.ground_truth())
 
 

@@ -38,6 +38,9 @@ class Smoother:
         self.values = gtsam.Values()
         self._factors: dict[Name, gtsam.NonlinearFactor] = {}
         self._slots: dict[Name, int] = {}  # of the factors in the tree
+        # QR takes longer, but copes with directions whose certainties differ by more than GTSAM's Cholesky allows
+        # (a factor of 4096 in standard deviations), as where odometry leaves some directions open.
+        self._by_qr = False
         self._isam = self._new_isam()
         self._new: list[Name]
         self._to_remove: list[int]
@@ -112,7 +115,10 @@ class Smoother:
     def optimise(self, values: gtsam.Values, iterations: int = BATCH_ITERATIONS) -> gtsam.Values:
         """The optimum of all factors by Levenberg-Marquardt, from these values; the tree stays as it is."""
         graph = self._graph(self._factors)
-        optimiser = gtsam.LevenbergMarquardtOptimizer(graph, values, gtsam.LevenbergMarquardtParams())
+        parameters = gtsam.LevenbergMarquardtParams()
+        if self._by_qr:
+            parameters.setLinearSolverType("MULTIFRONTAL_QR")
+        optimiser = gtsam.LevenbergMarquardtOptimizer(graph, values, parameters)
         error = optimiser.error()
         for _ in range(iterations):  # one at a time, so that other threads of the process are served in between
             optimiser.iterate()
@@ -122,7 +128,22 @@ class Smoother:
         return optimiser.values()
 
     def rebuild(self, values: gtsam.Values, last: Iterable[int]) -> None:
-        """A new tree of all factors, linearised at these values."""
+        """A new tree of all factors, linearised at these values.
+
+        Where Cholesky takes it for indeterminate it is made by QR, as is every later one.
+
+        Raises:
+            RuntimeError: GTSAM's; the tree is then no longer usable.
+        """
+        try:
+            self._rebuild(values, last)
+        except RuntimeError:
+            if self._by_qr:
+                raise
+            self._by_qr = True
+            self._rebuild(values, last)
+
+    def _rebuild(self, values: gtsam.Values, last: Iterable[int]) -> None:
         self._isam = self._new_isam()
         self._begin()
         self._slots.clear()
@@ -160,6 +181,8 @@ class Smoother:
 
     def _new_isam(self) -> gtsam.ISAM2:
         parameters = gtsam.ISAM2Params()
+        if self._by_qr:
+            parameters.setFactorization("QR")
         parameters.relinearizeSkip = 1  # `update` is told what may be relinearised
         thresholds = gtsam.ISAM2ThresholdMap()
         for letter, (size, threshold) in self._thresholds.items():

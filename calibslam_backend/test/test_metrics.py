@@ -108,6 +108,10 @@ def test_truth_between_its_poses() -> None:
     assert covered.tolist() == [False, True, True, False]
     np.testing.assert_allclose(poses[1][:3, 3], [0.5, 1.0, 1.5])
     np.testing.assert_allclose(poses[1][:3, :3], gtsam.Rot3.Yaw(0.2).matrix(), atol=1e-12)
+    # A pose of slow ground truth covers its own time, also beside a gap.
+    covered, poses = interpolated(with_gap, stamps)
+    assert covered.all()
+    np.testing.assert_allclose(poses[2][:3, 3], [9.0, 9.0, 9.0])
 
 
 def test_nees_by_hand() -> None:

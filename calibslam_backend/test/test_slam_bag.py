@@ -56,6 +56,7 @@ def test_a_run_folder(bag: Path, tmp_path: Path, capsys: pytest.CaptureFixture[s
     assert (metrics["rejected"]["images"], metrics["rejected"]["motions"]) == (110, 109)
     assert 0.0 < metrics["update_ms"]["p50"] <= metrics["update_ms"]["p99"] <= metrics["update_ms"]["max"]
     assert metrics["sequence_s"] == pytest.approx(109 / 30, abs=0.01)
+    assert (metrics["recording"], metrics["calibrator"]) == (str(bag.resolve()), None)
     said = capsys.readouterr().out
     assert f"{metrics['keyframes']} keyframes, 9 objects" in said and f"ATE {metrics['ate_m']:.3f} m" in said
     assert sorted(p.name for p in (tmp_path / "run").iterdir()) == [

@@ -46,7 +46,7 @@ class Detector:
         self.device = _device(settings.device)
         if settings.threads:
             torch.set_num_threads(settings.threads)
-        self.class_names = model.class_names
+        self.class_names, self.boxes = model.class_names, model.boxes
         self._model = model.to(self.device).eval()
         self._model.detector.roi_heads.score_thresh = settings.score_threshold
 

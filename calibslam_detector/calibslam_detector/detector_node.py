@@ -21,16 +21,15 @@ from rclpy.node import Node
 from sensor_msgs.msg import CompressedImage, Image
 
 from calibslam_detector.detector import Detector, DetectorSettings, DeviceError
-from calibslam_detector.image_conversion import decode_compressed, decode_raw, encode_jpeg
+from calibslam_detector.image_conversion import OVERLAY_QUALITY, decode_compressed, decode_raw, encode_jpeg
 from calibslam_detector.overlay import draw_overlay
-from calibslam_detector.weights_file import WeightsError
+from calibslam_detector.weights_file import SHIPPED, WeightsError
 from calibslam_msgs_py.conversions import RosTypes, boxes_to_msg, header_to_msg, stamp_from_msg, valid_boxes
 from calibslam_msgs_py.measurements import InvalidMeasurement
 from calibslam_msgs_py.node import MEASUREMENT, SENSOR, Counters, run
 from calibslam_msgs_py.settings import Settings, SettingsError, declare_parameters, setting
 
 SECONDS_BETWEEN_WARNINGS = 5.0
-OVERLAY_QUALITY = 85  # of JPEG
 # Of images like those learnt from, 5 % are strange; of 20 independent ones more than half once in 10^9 times.
 STRANGE_WINDOW, STRANGE_SHARE = 20, 0.5
 
@@ -39,7 +38,7 @@ STRANGE_WINDOW, STRANGE_SHARE = 20, 0.5
 class DetectorNodeSettings(Settings):
     """Parameters of the node beside those of the detector."""
 
-    weights: str = setting("", "file that `train` wrote")
+    weights: str = setting("", "file that `train` wrote; none: the weights that come with this package")
 
 
 @dataclass(frozen=True)
@@ -58,10 +57,9 @@ class DetectorNode(Node):
         super().__init__("detector")
         settings = declare_parameters(self, DetectorNodeSettings)
         detector_settings = declare_parameters(self, DetectorSettings)
-        if not settings.weights:
-            raise SettingsError("weights: name the file of a trained detector, e.g. -p weights:=RUN/weights.pt")
+        weights = Path(settings.weights) if settings.weights else SHIPPED
         try:
-            self._detector = Detector.from_file(Path(settings.weights), detector_settings)
+            self._detector = Detector.from_file(weights, detector_settings)
         except (WeightsError, DeviceError) as error:
             raise SettingsError(str(error)) from error
         self._detector(np.zeros((480, 640, 3), np.uint8))  # the first image takes longer; no camera shall wait for it

@@ -26,11 +26,12 @@ from calibslam_detector.calibration.reliability import plot, reliability
 from calibslam_detector.coco_data import BOX_KEYS, CocoData, DataError, load_coco_data, read_image
 from calibslam_detector.detector import Detector, DetectorSettings, DeviceError
 from calibslam_detector.matching import free_of_border, match
-from calibslam_detector.weights_file import WeightsError
+from calibslam_detector.weights_file import SHIPPED, WeightsError
 from calibslam_msgs_py.measurements import Array, Boxes
 from calibslam_msgs_py.settings import Settings, add_arguments, from_arguments, setting
 
 LEAST_SCORE = 0.05  # of boxes that count for the precision, as torchvision has it
+LEARNT = "learnt"
 SUM = 100  # squared residuals in a sum of ECE(q), as the published code has it
 
 
@@ -39,7 +40,11 @@ class EvaluationSettings(Settings):
     """What is compared."""
 
     score_threshold: float = setting(0.5, "boxes of a smaller score count for the precision only", low=LEAST_SCORE)
-    boxes: str = setting(BOX_KEYS[0], "true boxes: of visible parts or of whole objects", choices=BOX_KEYS)
+    boxes: str = setting(
+        LEARNT,
+        "true boxes: those the detector learnt, of visible parts, or of whole objects",
+        choices=(LEARNT, *BOX_KEYS),
+    )
 
 
 @dataclass(frozen=True)
@@ -155,7 +160,13 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Command line of `evaluate_detector`; returns the exit code."""
     parser = argparse.ArgumentParser(prog="evaluate_detector", description=__doc__)
     parser.add_argument("data", type=Path, metavar="DIR", help="annotations.json and images/")
-    parser.add_argument("--weights", type=Path, required=True, metavar="FILE", help="detector that `train` wrote")
+    parser.add_argument(
+        "--weights",
+        type=Path,
+        default=SHIPPED,
+        metavar="FILE",
+        help="detector that `train` wrote (default: the shipped)",
+    )
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="for metrics.json and reliability.png")
     parser.add_argument("--device", choices=("auto", "cpu", "cuda"), default="auto", help="(default: %(default)s)")
     add_arguments(parser, EvaluationSettings)
@@ -163,8 +174,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     settings = from_arguments(arguments, EvaluationSettings)
     try:
         detector = Detector.from_file(arguments.weights, DetectorSettings(LEAST_SCORE, arguments.device))
+        boxes = detector.boxes if settings.boxes == LEARNT else settings.boxes
         data = load_coco_data(
-            arguments.data / "annotations.json", arguments.data / "images", detector.class_names, settings.boxes
+            arguments.data / "annotations.json", arguments.data / "images", detector.class_names, boxes
         )
     except (DataError, WeightsError, DeviceError) as error:
         print(f"evaluate_detector: {error}", file=sys.stderr)

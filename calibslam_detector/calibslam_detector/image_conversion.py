@@ -1,4 +1,4 @@
-"""Images as cameras publish them -> RGB, whatever the encoding; without ROS."""
+"""Images as cameras publish them -> RGB or depth in metres, whatever the encoding; without ROS."""
 
 from __future__ import annotations
 
@@ -23,6 +23,16 @@ ENCODINGS: dict[str, tuple[int, int | None]] = {
     "yuv422": (2, cv2.COLOR_YUV2RGB_UYVY),
     "yuv422_yuy2": (2, cv2.COLOR_YUV2RGB_YUY2),
 }
+
+# Encodings of depth (REP 118): type of a pixel, and metres per unit.
+DEPTH_ENCODINGS: dict[str, tuple[str, float]] = {
+    "16UC1": ("u2", 0.001),
+    "mono16": ("u2", 0.001),
+    "32FC1": ("f4", 1.0),
+}
+# What compressed_depth_image_transport writes before the PNG: the format and the two numbers of its quantisation.
+COMPRESSED_DEPTH_HEADER = 12  # bytes
+OVERLAY_QUALITY = 85  # of JPEG
 
 
 def decode_raw(data: np.ndarray, height: int, width: int, step: int, encoding: str) -> np.ndarray:
@@ -56,6 +66,50 @@ def decode_compressed(data: np.ndarray) -> np.ndarray:
     if image is None:
         raise InvalidMeasurement("corrupt_image", f"{data.size} bytes that are no image that can be decoded")
     return np.ascontiguousarray(image[..., ::-1])
+
+
+def decode_depth(
+    data: np.ndarray, height: int, width: int, step: int, encoding: str, is_bigendian: bool = False
+) -> np.ndarray:
+    """(H, W) float32 [m] of the bytes of a sensor_msgs/Image with depth; 0 or not finite where unknown (REP 118).
+
+    Raises:
+        InvalidMeasurement: an encoding that is none of depth, or a size that does not fit the data.
+    """
+    if encoding not in DEPTH_ENCODINGS:
+        raise InvalidMeasurement(
+            "depth_encoding",
+            f"depth encoding '{encoding}'; known: {', '.join(DEPTH_ENCODINGS)} (16 bit: mm, 32 bit: m)",
+        )
+    kind, metres = DEPTH_ENCODINGS[encoding]
+    pixel = np.dtype((">" if is_bigendian else "<") + kind)
+    if height < 1 or width < 1 or step < width * pixel.itemsize or data.size < height * step:
+        raise InvalidMeasurement(
+            "depth_size", f"depth of {width} x {height} pixels, {step} bytes a row, in {data.size} bytes"
+        )
+    rows = np.ascontiguousarray(data[: height * step].reshape(height, step)[:, : width * pixel.itemsize])
+    return rows.view(pixel).astype(np.float32) * np.float32(metres)
+
+
+def decode_compressed_depth(data: np.ndarray, image_format: str) -> np.ndarray:
+    """(H, W) float32 [m] of a sensor_msgs/CompressedImage with 16-bit depth, as compressed_depth_image_transport
+    writes it, or a bare PNG (bytes as uint8).
+
+    Raises:
+        InvalidMeasurement: depth of another kind, or damaged.
+    """
+    if image_format.startswith("32FC1"):
+        raise InvalidMeasurement(
+            "depth_encoding", "compressed 32FC1 depth is not supported: publish it raw, or as 16UC1"
+        )
+    png = data[COMPRESSED_DEPTH_HEADER:] if "compressedDepth" in image_format else data
+    try:
+        depth = cv2.imdecode(png, cv2.IMREAD_UNCHANGED) if png.size else None
+    except cv2.error:
+        depth = None
+    if depth is None or depth.dtype != np.uint16 or depth.ndim != 2:
+        raise InvalidMeasurement("corrupt_depth", f"{data.size} bytes that are no 16-bit PNG of depth")
+    return depth.astype(np.float32) * np.float32(DEPTH_ENCODINGS["16UC1"][1])
 
 
 def encode_jpeg(image: np.ndarray, quality: int) -> bytes:

@@ -24,6 +24,7 @@ from torchvision.ops import batched_nms, clip_boxes_to_image, remove_small_boxes
 from torchvision.ops.misc import FrozenBatchNorm2d
 
 from calibslam_detector.box_covariance import corner_covariances, rescaled
+from calibslam_detector.coco_data import BOX_KEYS
 from calibslam_detector.covariance_head import CovarianceHead, geometry
 from calibslam_detector.familiarity import Familiarity, descriptor
 
@@ -117,11 +118,15 @@ class CalibratedDetector(nn.Module):
         architecture: of ARCHITECTURES.
         class_names: without the background; the label of the first is 1.
         frozen_norm: normalise by fixed numbers, as torchvision's COCO weights do, instead of those of a batch.
+        boxes: which boxes it learns, of `coco_data.BOX_KEYS`.
     """
 
-    def __init__(self, architecture: str, class_names: tuple[str, ...], frozen_norm: bool = False) -> None:
+    def __init__(
+        self, architecture: str, class_names: tuple[str, ...], frozen_norm: bool = False, boxes: str = BOX_KEYS[0]
+    ) -> None:
         super().__init__()
         self.architecture, self.class_names, self.frozen_norm = architecture, class_names, frozen_norm
+        self.boxes = boxes
         classes = len(class_names) + 1
         self.detector = ARCHITECTURES[architecture](classes)
         if frozen_norm:

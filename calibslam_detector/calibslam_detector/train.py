@@ -136,15 +136,21 @@ def _begin(arguments: argparse.Namespace, settings: TrainSettings) -> tuple[Cali
     images = arguments.images or arguments.data / "images"
     if arguments.weights is not None:
         model = weights_file.load(arguments.weights)
+        if arguments.stage == "covariance" and model.boxes != settings.boxes:
+            raise TrainingError(
+                f"{arguments.weights} has learnt {model.boxes}, and its covariances must be of the same boxes: "
+                f"say --boxes {model.boxes}"
+            )
+        model.boxes = settings.boxes
         return model, load_coco_data(annotations, images, model.class_names, settings.boxes)
     if arguments.stage == "covariance":
         model = weights_file.load_coco(arguments.coco_weights, settings.architecture)
         return model, load_coco_data(annotations, images, model.class_names, settings.boxes)
     data = load_coco_data(annotations, images, box_key=settings.boxes)
     if arguments.coco_weights is None:
-        return CalibratedDetector(settings.architecture, data.class_names), data
+        return CalibratedDetector(settings.architecture, data.class_names, boxes=settings.boxes), data
     trained = weights_file.load_coco(arguments.coco_weights, settings.architecture)
-    model = CalibratedDetector(settings.architecture, data.class_names, trained.frozen_norm)
+    model = CalibratedDetector(settings.architecture, data.class_names, trained.frozen_norm, settings.boxes)
     # All but what depends on the number of classes.
     shapes = {name: value.shape for name, value in model.state_dict().items()}
     fitting = {name: value for name, value in trained.state_dict().items() if value.shape == shapes[name]}

@@ -21,7 +21,9 @@ COCO = {
     "mobilenet_v3_large_320_fpn": FasterRCNN_MobileNet_V3_Large_320_FPN_Weights.COCO_V1,
     "resnet50_fpn_v2": FasterRCNN_ResNet50_FPN_V2_Weights.COCO_V1,
 }
-KEYS = {"format", "version", "architecture", "class_names", "frozen_norm", "weights"}
+KEYS = {"format", "version", "architecture", "class_names", "frozen_norm", "boxes", "weights"}
+# The detector that comes with this package; MODEL_CARD.md beside it says what it can do.
+SHIPPED = Path(__file__).with_name("default_weights") / "compact.pt"
 
 
 class WeightsError(ValueError):
@@ -37,6 +39,7 @@ def save(model: CalibratedDetector, path: Path, half: bool = False) -> None:
         "architecture": model.architecture,
         "class_names": list(model.class_names),
         "frozen_norm": model.frozen_norm,
+        "boxes": model.boxes,
         "weights": weights,
     }
     write_safely(content, path)
@@ -49,7 +52,7 @@ def write_safely(content: dict[str, Any], path: Path) -> None:
     part.replace(path)
 
 
-def load(path: Path) -> CalibratedDetector:
+def load(path: Path = SHIPPED) -> CalibratedDetector:
     """The detector of a file, on the CPU, ready to detect.
 
     Raises:
@@ -67,7 +70,9 @@ def load(path: Path) -> CalibratedDetector:
     architecture = content["architecture"]
     if architecture not in ARCHITECTURES:
         raise WeightsError(f"{path} is of unknown architecture {architecture!r}; known: {', '.join(ARCHITECTURES)}")
-    model = CalibratedDetector(architecture, tuple(content["class_names"]), bool(content["frozen_norm"]))
+    model = CalibratedDetector(
+        architecture, tuple(content["class_names"]), bool(content["frozen_norm"]), str(content["boxes"])
+    )
     _fill(model, content["weights"], path, architecture)
     return model.eval()
 

@@ -315,6 +315,27 @@ def test_stage_covariance_needs_a_detector(data: Path, tmp_path: Path, capsys: p
     assert "--weights FILE" in capsys.readouterr().err
 
 
+def test_covariances_are_of_the_boxes_that_were_learnt(
+    data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    content = json.loads((data / "annotations.json").read_text())
+    for annotation in content["annotations"]:
+        annotation["amodal_bbox"] = annotation["bbox"]
+    (tmp_path / "amodal.json").write_text(json.dumps(content))
+    given = [str(data), "--annotations", str(tmp_path / "amodal.json")]
+    boxes = ["--boxes", "amodal_bbox"]
+    assert train.main([*given, *boxes, *FAST, "--steps", "1", "--out", str(tmp_path / "whole")]) == 0
+    weights = tmp_path / "whole" / "weights.pt"
+    assert weights_file.load(weights).boxes == "amodal_bbox"
+    options = ["--stage", "covariance", "--weights", str(weights), "--out", str(tmp_path / "run")]
+    assert train.main([*given, *options]) == 1
+    assert "say --boxes amodal_bbox" in capsys.readouterr().err
+    assert not (tmp_path / "run").exists()
+    # And they are what a detector is judged by: this data set has none.
+    assert evaluate_detector.main([str(data), "--weights", str(weights), "--out", str(tmp_path / "evaluation")]) == 1
+    assert "annotation without amodal_bbox (8)" in capsys.readouterr().err
+
+
 def test_too_few_boxes_found_again_are_said(data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     weights_file.save(CalibratedDetector("compact", tuple(COLOURS)), tmp_path / "begin.pt")
     options = ["--stage", "covariance", "--weights", str(tmp_path / "begin.pt"), "--out", str(tmp_path / "run")]
@@ -356,6 +377,7 @@ def test_files_that_cannot_be_used_are_refused(saved: tuple[CalibratedDetector, 
     bad = {
         "is not a detector of CalibSLAM": weights,
         "has version 9": {**content, "version": 9},
+        "lacks boxes": {k: v for k, v in content.items() if k != "boxes"},
         "lacks class_names": {k: v for k, v in content.items() if k != "class_names"},
         "unknown architecture 'yolo'": {**content, "architecture": "yolo"},
         "does not fit mobilenet_v3_large_320_fpn": {**content, "architecture": "mobilenet_v3_large_320_fpn"},

@@ -34,8 +34,7 @@ def definitions_folder() -> Path:
     )
 
 
-@cache
-def calibslam_typestore() -> Typestore:
+def new_typestore() -> Typestore:
     """ROS 2 Jazzy and calibslam_msgs."""
     store = get_typestore(Stores.ROS2_JAZZY)
     definitions: dict[str, Any] = {}
@@ -43,6 +42,12 @@ def calibslam_typestore() -> Typestore:
         definitions.update(get_types_from_msg(file.read_text(), f"{PACKAGE}/msg/{file.stem}"))
     store.register(definitions)
     return store
+
+
+@cache
+def calibslam_typestore() -> Typestore:
+    """The one that all share; nothing is registered in it."""
+    return new_typestore()
 
 
 class BagTypes:

@@ -14,11 +14,13 @@ from types import TracebackType
 from typing import Any, Literal
 
 from rosbags.interfaces import Connection, MessageDefinitionFormat
+from rosbags.interfaces.typing import Typesdict
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, Reader, StoragePlugin, Writer
 from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
+from rosbags.typesys.base import TypesysError
 from rosbags.typesys.store import Typestore
 
-from calibslam_msgs_py.bag_types import BagError, BagTypes, calibslam_typestore
+from calibslam_msgs_py.bag_types import BagError, BagTypes, calibslam_typestore, new_typestore
 
 __all__ = ["BagError", "BagReader", "BagWriter", "types"]
 
@@ -94,27 +96,36 @@ class BagReader:
     def _typestore(self, connections: list[Connection]) -> Typestore:
         """The definitions inside the bag; those of ROS 2 Jazzy and of this version where it has none."""
         store = get_typestore(Stores.EMPTY)
-        fallback = calibslam_typestore()
         for connection in connections:
-            name, definition = connection.msgtype, connection.msgdef
-            text = definition.data
-            if not text.strip():  # recorded where the type was not installed, or by an old version of ROS
-                if name not in fallback.fielddefs:
-                    raise BagError(
-                        f"{self.path}: unknown message type {name} (topic {connection.topic}): the bag holds "
-                        "no definition of it; record it again where that package is installed"
-                    )
-                text = fallback.generate_msgdef(name, ros_version=2)[0]
             try:
-                if definition.format is MessageDefinitionFormat.IDL:
-                    store.register(get_types_from_idl(text))
-                else:
-                    store.register(get_types_from_msg(text, name))
-            except Exception as error:
-                raise BagError(
-                    f"{self.path}: the definition of {name} (topic {connection.topic}) is not usable: {error}"
-                ) from error
+                store.register(self._definitions(connection))
+            except TypesysError as error:
+                raise self._unusable(connection, error) from error
         return store
+
+    def _definitions(self, connection: Connection) -> Typesdict:
+        """The type of a topic with all that it consists of."""
+        name, definition = connection.msgtype, connection.msgdef
+        text = definition.data
+        if not text.strip():  # recorded where the type was not installed, or by an old version of ROS
+            fallback = calibslam_typestore()
+            if name not in fallback.fielddefs:
+                raise BagError(
+                    f"{self.path}: unknown message type {name} (topic {connection.topic}): the bag holds "
+                    "no definition of it; record it again where that package is installed"
+                )
+            text = fallback.generate_msgdef(name, ros_version=2)[0]
+        try:
+            if definition.format is MessageDefinitionFormat.IDL:
+                return get_types_from_idl(text)
+            return get_types_from_msg(text, name)
+        except Exception as error:
+            raise self._unusable(connection, error) from error
+
+    def _unusable(self, connection: Connection, error: Exception) -> BagError:
+        return BagError(
+            f"{self.path}: the definition of {connection.msgtype} (topic {connection.topic}) is not usable: {error}"
+        )
 
     def _raw(self, connections: list[Connection]) -> Iterator[tuple[Connection, int, bytes | memoryview]]:
         messages = self._reader.messages(connections) if connections else iter(())
@@ -219,6 +230,21 @@ class BagWriter:
         """Add a serialised (CDR) message of type `kind`, such as "nav_msgs/msg/Path"."""
         self.add_topic(topic, kind)
         self._writer.write(self._connections[topic], int(stamp), data)
+
+    def adopt(self, bag: BagReader) -> list[str]:
+        """Learn the message types of another bag; returns its topics whose messages can be copied as they are.
+
+        Not those of which the bag holds no definition, or one that contradicts ours of the same name.
+        """
+        self._store = new_typestore()
+        topics = set()
+        for connection in bag._reader.connections:
+            try:
+                self._store.register(bag._definitions(connection))
+            except (BagError, TypesysError):
+                continue
+            topics.add(connection.topic)
+        return sorted(topics)
 
     def add_topic(self, topic: str, kind: str) -> None:
         """Make a topic, also if no message follows.

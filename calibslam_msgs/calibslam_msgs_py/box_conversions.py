@@ -17,6 +17,8 @@ from calibslam_msgs_py.geometry_conversions import (
 from calibslam_msgs_py.measurements import Array, Boxes, InvalidMeasurement
 from calibslam_msgs_py.message_types import MessageTypes
 
+LARGEST_COORDINATE = 1e6  # [px] of a corner, many times any image: what is larger is garbage
+
 
 def boxes_from_msg(msg: Any) -> Boxes:
     """Boxes of a BoundingBoxArray, unfiltered: see `valid_boxes`.
@@ -54,12 +56,12 @@ def _box_covariance(flat: Array) -> Array:
 def valid_boxes(boxes: Boxes) -> tuple[Boxes, dict[str, int]]:
     """The usable boxes, and how many were dropped for which reason.
 
-    Reasons: `nan` (corner or score not finite), `empty` (xmin >= xmax or ymin >= ymax), `outside` (no part of
-    the box in the image), `covariance` (known, but not finite, symmetric and positive definite). A box counts
-    once, under the first that applies.
+    Reasons: `nan` (corner or score not finite, or a corner farther than `LARGEST_COORDINATE` away), `empty` (xmin >=
+    xmax or ymin >= ymax), `outside` (no part of the box in the image), `covariance` (known, but not finite, symmetric
+    and positive definite). A box counts once, under the first that applies.
     """
     xmin, ymin, xmax, ymax = boxes.corners.T
-    finite = np.isfinite(boxes.corners).all(axis=1) & np.isfinite(boxes.scores)
+    finite = (np.abs(boxes.corners) <= LARGEST_COORDINATE).all(axis=1) & np.isfinite(boxes.scores)
     outside = (xmax <= 0.0) | (ymax <= 0.0) | (xmin >= boxes.width) | (ymin >= boxes.height)
     defects = {
         "nan": ~finite,

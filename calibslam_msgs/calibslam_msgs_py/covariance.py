@@ -11,6 +11,9 @@ from calibslam_msgs_py.measurements import Array
 # matter: asymmetry that rounding explains, and the smallest eigenvalue that can be inverted sensibly.
 SYMMETRY_TOLERANCE = 1e-6
 DEFINITE_LIMIT = 1e-10
+# Variances beyond these, in whatever SI unit or pixels, are garbage that no double can be weighted with: a nanometre
+# and farther than the moon.
+SMALLEST_VARIANCE, LARGEST_VARIANCE = 1e-18, 1e18
 
 
 def ros_from_gtsam_jacobian(R: Array) -> Array:
@@ -48,12 +51,14 @@ def symmetric(covariances: Array) -> Array:
 
 
 def is_covariance(matrices: Array) -> NDArray[np.bool_]:
-    """(...,) whether each of the matrices (..., n, n) is finite, symmetric and positive definite.
+    """(...,) whether each of the matrices (..., n, n) is finite, symmetric, positive definite and of sensible size.
 
     A singular matrix would claim that some direction is known exactly; no factor can be weighted with it.
     """
     variances = np.diagonal(matrices, axis1=-2, axis2=-1)
-    usable = np.asarray(np.isfinite(matrices).all(axis=(-1, -2)) & (variances > 0.0).all(axis=-1))
+    sensible = (variances >= SMALLEST_VARIANCE) & (variances <= LARGEST_VARIANCE)
+    # No covariance is larger than the variances: this also keeps what follows from overflowing.
+    usable = np.asarray(sensible.all(axis=-1) & (np.abs(matrices) <= LARGEST_VARIANCE).all(axis=(-1, -2)))
     safe = np.where(usable[..., None, None], matrices, np.eye(matrices.shape[-1]))
     scale = 1.0 / np.sqrt(np.diagonal(safe, axis1=-2, axis2=-1))
     correlation = scale[..., :, None] * safe * scale[..., None, :]

@@ -60,8 +60,8 @@ def validate(settings: Any) -> None:
     Raises:
         SettingsError: naming the first bad value and what is valid.
     """
-    kinds = _kinds(type(settings))
-    for field in _fields(type(settings)):
+    kinds = kinds_of(type(settings))
+    for field in settings_fields(type(settings)):
         _checked(field, kinds[field.name], getattr(settings, field.name))
 
 
@@ -71,18 +71,18 @@ def from_mapping(cls: type[S], values: Mapping[str, Any]) -> S:
     Raises:
         SettingsError: an unknown name or a bad value.
     """
-    fields = {field.name: field for field in _fields(cls)}
+    fields = {field.name: field for field in settings_fields(cls)}
     for name in values:
         if name not in fields:
             raise SettingsError(f"unknown setting '{name}'; valid are: {', '.join(fields)}")
-    kinds = _kinds(cls)
+    kinds = kinds_of(cls)
     return cls(**{name: _checked(fields[name], kinds[name], value) for name, value in values.items()})
 
 
 def add_arguments(parser: argparse.ArgumentParser, cls: type) -> None:
     """Options of a command line: `frame_rate` becomes --frame-rate, a bool --x and --no-x."""
-    kinds = _kinds(cls)
-    for field in _fields(cls):
+    kinds = kinds_of(cls)
+    for field in settings_fields(cls):
         kind, choices = kinds[field.name], field.metadata["choices"]
         text = f"{describe(field)} (default: {field.default})".replace("%", "%%")
         option = "--" + field.name.replace("_", "-")
@@ -109,7 +109,7 @@ def add_arguments(parser: argparse.ArgumentParser, cls: type) -> None:
 
 def from_arguments(arguments: argparse.Namespace, cls: type[S]) -> S:
     """The settings that a parser with `add_arguments` read."""
-    return from_mapping(cls, {field.name: getattr(arguments, field.name) for field in _fields(cls)})
+    return from_mapping(cls, {field.name: getattr(arguments, field.name) for field in settings_fields(cls)})
 
 
 def declare_parameters(node: Any, cls: type[S]) -> S:
@@ -121,9 +121,9 @@ def declare_parameters(node: Any, cls: type[S]) -> S:
     from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
     from rclpy.exceptions import InvalidParameterValueException
 
-    kinds = _kinds(cls)
+    kinds = kinds_of(cls)
     values = {}
-    for field in _fields(cls):
+    for field in settings_fields(cls):
         low, high = field.metadata["low"], field.metadata["high"]
         descriptor = ParameterDescriptor(
             description=describe(field),
@@ -161,21 +161,22 @@ def describe(field: dataclasses.Field[Any]) -> str:
     text = str(field.metadata["meaning"])
     if field.metadata["unit"]:
         text += f" [{field.metadata['unit']}]"
-    valid = _valid(field)
+    valid = valid_values(field)
     return f"{text}; {valid}" if valid else text
 
 
-def _fields(cls: type) -> list[dataclasses.Field[Any]]:
+def settings_fields(cls: type) -> list[dataclasses.Field[Any]]:
+    """Those of a dataclass that are settings."""
     return [field for field in dataclasses.fields(cls) if "meaning" in field.metadata]
 
 
-def _kinds(cls: type) -> dict[str, type]:
+def kinds_of(cls: type) -> dict[str, type]:
     """Name -> bool, int, float or str; annotations may be texts."""
     return typing.get_type_hints(cls)
 
 
-def _valid(field: dataclasses.Field[Any]) -> str:
-    """What is valid, in words."""
+def valid_values(field: dataclasses.Field[Any]) -> str:
+    """What is valid, in words; "" where everything of its type is."""
     low, high, choices = field.metadata["low"], field.metadata["high"], field.metadata["choices"]
     if choices:
         return f"one of {', '.join(choices)}"
@@ -196,7 +197,7 @@ def _checked(field: dataclasses.Field[Any], kind: type, value: Any) -> Any:
     low, high, choices = field.metadata["low"], field.metadata["high"], field.metadata["choices"]
     outside = (low is not None and value < low) or (high is not None and value > high)
     if outside or (choices and value not in choices) or (kind is float and math.isnan(value)):
-        valid = _valid(field) or expected
+        valid = valid_values(field) or expected
         raise SettingsError(f"{field.name} = {value!r}: must be {valid} ({describe(field)})")
     return value
 

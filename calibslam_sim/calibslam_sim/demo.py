@@ -1,8 +1,9 @@
 """`demo`: the whole system on a simulated recording, as separate processes, with a table of results.
 
-A desk is simulated and written to a bag. The bag is played to the odometry node and to two back ends: one
-believes every box alike, one believes each as much as its own covariance says. Both maps are compared with the
-truth.
+A desk is simulated and written to a bag: boxes as a detector might draw them, and rendered images, on which the
+detector that comes with CalibSLAM draws its own. All is played to the odometry node and to three back ends: one
+believes every simulated box alike, one believes each as much as its own covariance says, and one gets the boxes and
+covariances of the detector. The maps are compared with the truth.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ import os
 import signal
 import sys
 import time
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,12 +21,12 @@ from typing import Any
 
 from calibslam_backend.object_map import ObjectMap
 from calibslam_msgs_py.bags import BagError, BagReader
+from calibslam_sim import demo_images, topics
 from calibslam_sim.evaluate import evaluate
 from calibslam_sim.processes import POLL, ProcessFailed, ProcessGroup
 from calibslam_sim.progress import Progress
 from calibslam_sim.reference import read_reference
-from calibslam_sim.simulate import write_bag
-from calibslam_sim.simulation import SCENARIOS, SimulationSettings, simulate
+from calibslam_sim.simulation import SCENARIOS, SimulationSettings
 
 START_TIMEOUT = 90.0  # [s] for all nodes to be there; compiling for the first time takes a while
 SAVE_TIMEOUT = 120.0  # [s]
@@ -37,16 +39,18 @@ RESULTS = ("map.json", "metrics.json", "trajectory.png", "trajectory.tum")
 
 @dataclass(frozen=True)
 class Condition:
-    """One back end of the demo: its namespace and folder, its noise model, what it is called in the table."""
+    """One back end of the demo: its namespace and folder, its noise model, the topic of its boxes, its title."""
 
     name: str
     noise_model: str
+    detections: str
     title: str
 
 
 CONDITIONS = (
-    Condition("fixed", "fixed", "SLAM, every edge 5 px"),
-    Condition("calibrated", "calibrated", "SLAM, each box's own covariance"),
+    Condition("fixed", "fixed", topics.DETECTIONS, "SLAM, every edge 5 px"),
+    Condition("calibrated", "calibrated", topics.DETECTIONS, "SLAM, each box's own covariance"),
+    Condition("images", "calibrated", demo_images.DETECTED, "SLAM from images, by the detector"),
 )
 
 
@@ -64,11 +68,9 @@ def run_live(bag: Path, out: Path, rate: float) -> None:
         processes.start("odometry", "calibslam_sim.odometry_node", [])
         for condition in CONDITIONS:
             namespace = ["--ros-args", "-r", f"__ns:=/{condition.name}"]
-            inputs = [
-                part
-                for topic in ("detections", "relative_pose", "camera/camera_info")
-                for part in ("-r", f"{topic}:=/{topic}")
-            ]
+            inputs = ["-r", f"detections:={condition.detections}"]
+            for topic in ("relative_pose", "camera/camera_info"):
+                inputs += ["-r", f"{topic}:=/{topic}"]
             processes.start(
                 condition.name,
                 "calibslam_backend.backend_node",
@@ -79,7 +81,7 @@ def run_live(bag: Path, out: Path, rate: float) -> None:
                 "calibslam_sim.record_node",
                 [*namespace, "-p", f"out:={out / condition.name / 'run.mcap'}"],
             )
-        everybody = {"/odom": 1, "/relative_pose": len(CONDITIONS), "/detections": len(CONDITIONS)}
+        everybody = {"/odom": 1, "/relative_pose": len(CONDITIONS)} | Counter(c.detections for c in CONDITIONS)
         waiting = [part for topic, n in everybody.items() for part in ("--wait-for", f"{topic}:{n}")]
         processes.start(
             "play",
@@ -169,7 +171,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     for ending in (signal.SIGTERM, signal.SIGHUP):
         signal.signal(ending, signal.default_int_handler)
     out = arguments.out.absolute()
-    bag = out / "bag"
+    bag, detected = out / "bag", out / "detected"
     begin = time.monotonic()
 
     def say(text: str) -> None:
@@ -177,15 +179,19 @@ def main(argv: Sequence[str] | None = None) -> int:
 
     try:
         settings = SimulationSettings(seed=arguments.seed, duration=arguments.duration, **SCENARIOS[arguments.scenario])
-        say(f"simulating {settings.duration:g} s of a camera walked around a desk")
-        write_bag(simulate(settings), bag, overwrite=True)
+        say(f"simulating {settings.duration:g} s of a camera walked around a desk, and rendering its images")
+        demo_images.record(settings, bag)
+        say("detecting objects in the images")
+        boxes = demo_images.detect(bag, detected)
+        demo_images.write_overlay(bag, detected, out / "overlay.png")
+        say(f"{boxes} boxes, each with a covariance")
         say(f"playing it at {arguments.rate:g} times its speed to odometry and {len(CONDITIONS)} back ends")
         for condition in CONDITIONS:
             folder = out / condition.name
             folder.mkdir(parents=True, exist_ok=True)
             for name in RESULTS:  # nothing of an earlier demo may be taken for a result of this one
                 (folder / name).unlink(missing_ok=True)
-        run_live(bag, out, arguments.rate)
+        run_live(detected, out, arguments.rate)
         say("comparing the maps with the truth")
         reference = read_reference(bag)
         results = {condition.name: evaluate(out / condition.name, reference) for condition in CONDITIONS}
@@ -197,6 +203,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         return 1
     say("done")
     print(f"\n{table(results)}\n")
+    print(f"{out / 'overlay.png'}: what the detector saw in one of the images, with ellipses of 2 sigma")
     for condition in CONDITIONS:
         print(f"{out / condition.name}/: {', '.join(RESULTS)}, run.mcap (opens in Foxglove)")
     return 0

@@ -1,7 +1,7 @@
 """`experiment NAME --out DIR`: one of the document's experiments, with table, JSON, CSV and figure.
 
 Conditions are compared on the same worlds and noise. Interrupt it as you like: the same command goes on where it
-stopped. The same command gives the same numbers, whatever the number of processes.
+stopped, unless the code has changed. The same command gives the same numbers, whatever the number of processes.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from pathlib import Path
 from calibslam_msgs_py.settings import SettingsError, add_arguments, from_arguments
 from calibslam_sim.experiments.design import Experiment, ExperimentError, ExperimentSettings
 from calibslam_sim.experiments.engine import run
+from calibslam_sim.experiments.fingerprint import fingerprint
 from calibslam_sim.experiments.outputs import result_of, table, write
 from calibslam_sim.experiments.registry import MODULES, load
 from calibslam_sim.experiments.run_store import RunStore
@@ -38,14 +39,15 @@ def perform(
     """
     experiment = load(name)
     conditions = experiment.conditions(settings)
-    store = RunStore(out, name, settings, overwrite)
+    code = fingerprint()
+    store = RunStore(out, name, settings, code, overwrite)
     wanted = store.missing(conditions, repetitions)
     with Progress(len(wanted), name) as progress:
         for repetition in run(name, settings, wanted, jobs, backend):
             store.add(repetition)
             progress.step()
     values = store.values(conditions, repetitions)
-    result = result_of(name, experiment, settings, values, command, store.seconds(conditions, repetitions))
+    result = result_of(name, experiment, settings, values, code, command, store.seconds(conditions, repetitions))
     write(result, out)
     experiment.figure(result, out / f"{name}.png")
     return result

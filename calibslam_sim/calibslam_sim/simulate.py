@@ -40,6 +40,7 @@ def write_bag(
     overwrite: bool = False,
     render: Callable[[int], RenderedImage] | None = None,
     coco: CocoWriter | None = None,
+    image_every: int = 1,
 ) -> None:
     """Write what was measured and the truth.
 
@@ -49,6 +50,7 @@ def write_bag(
     Args:
         render: makes the image of a time; then there is /camera/image_raw/compressed as well.
         coco: takes these images and their boxes, too.
+        image_every: only the first of so many times has an image.
     """
     types = bags.types
     T_odom_camera = [np.eye(4)]
@@ -77,7 +79,7 @@ def write_bag(
             bag.write(topics.CAMERA_INFO, camera_to_msg(simulation.camera, stamp, types), stamp)
             bag.write(topics.GROUND_TRUTH, stamped_pose_to_msg(truth, topics.WORLD, types), stamp)
             bag.write(topics.DETECTIONS, boxes_to_msg(simulation.boxes[k], types), stamp)
-            if render is not None:
+            if render is not None and k % image_every == 0:
                 image = render(stamp)
                 bag.write(topics.IMAGE, _image(stamp, simulation.camera.frame_id, image), stamp)
                 if coco is not None:
@@ -102,6 +104,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--overwrite", action="store_true", help="replace the bag if it exists")
     parser.add_argument("--images", action="store_true", help="render the images, too (about 0.1 s each)")
     parser.add_argument(
+        "--image-every", type=int, default=1, metavar="N", help="render the first of every N images only (default: all)"
+    )
+    parser.add_argument(
         "--looks", choices=FAMILIES, default=FAMILIES[0], help="of rendered images (default: %(default)s)"
     )
     parser.add_argument(
@@ -112,6 +117,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     arguments = parser.parse_args(argv)
     if arguments.coco is not None and not arguments.images:
         parser.error("--coco needs --images")
+    if arguments.image_every < 1:
+        parser.error(f"--image-every must be 1 or more, not {arguments.image_every}")
     settings = from_arguments(arguments, SimulationSettings)
     start = time.monotonic()
     try:
@@ -121,7 +128,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             render = Renderer(simulation.world, simulation.camera, settings.seed, settings.pace, arguments.looks).render
         if arguments.coco is not None:
             coco = CocoWriter(arguments.coco, arguments.overwrite)
-        write_bag(simulation, arguments.out, arguments.overwrite, render, coco)
+        write_bag(simulation, arguments.out, arguments.overwrite, render, coco, arguments.image_every)
         if coco is not None:
             coco.close()
     except (bags.BagError, CocoError) as error:

@@ -15,7 +15,9 @@ from calibslam_msgs_py.message_types import MessageTypes
 DETECTIONS, DETECTIONS_WITHOUT_COVARIANCE = recording.BOXES, recording.RAW_BOXES
 CAMERA_INFO, ODOMETRY, GROUND_TRUTH = recording.CAMERA, recording.ODOMETRY, recording.GROUND_TRUTH
 IMAGE = "/camera/image_raw/compressed"
+RAW_IMAGE = "/camera/image_raw"
 DEPTH = "/camera/depth/image_raw"
+COMPRESSED_DEPTH = "/camera/depth/image_raw/compressedDepth"
 GROUND_TRUTH_QUADRICS = "/ground_truth_quadrics"
 
 WORLD = "world"  # frame of the ground truth

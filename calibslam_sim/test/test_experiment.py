@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import math
+import re
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,7 @@ import pytest
 from scipy import stats
 
 from calibslam_sim import experiment
-from calibslam_sim.experiments import kalman
+from calibslam_sim.experiments import fingerprint, kalman
 from calibslam_sim.experiments.design import ExperimentError, repetition_seed, scale_name
 from calibslam_sim.experiments.engine import run
 from calibslam_sim.experiments.kalman import KalmanSettings
@@ -21,6 +22,7 @@ from calibslam_sim.experiments.outputs import mean_and_deviation, p_value
 from calibslam_sim.experiments.run_store import REPETITIONS, SETTINGS, Repetition, RunStore
 from calibslam_sim.experiments.statistics import half_interval, nees_interval, paired, summary
 
+CODE = "0.1.0+abc"
 QUICK = ("kalman", "--quick", "--steps", "5", "--seeds", "4")
 
 
@@ -175,25 +177,50 @@ def test_other_settings_are_refused(tmp_path: Path, capsys: pytest.CaptureFixtur
 
 
 def test_another_experiment_is_refused(tmp_path: Path) -> None:
-    RunStore(tmp_path, "toy", KalmanSettings())
+    RunStore(tmp_path, "toy", KalmanSettings(), CODE)
     with pytest.raises(ExperimentError, match="holds the experiment toy"):
-        RunStore(tmp_path, "kalman", KalmanSettings())
+        RunStore(tmp_path, "kalman", KalmanSettings(), CODE)
+
+
+def test_what_other_code_has_computed_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    call(tmp_path, "--jobs", "1")
+    header = json.loads((tmp_path / SETTINGS).read_text())
+    assert header["code"] == fingerprint.fingerprint()
+    for before in ({**header, "code": "0.0.9+123"}, {k: v for k, v in header.items() if k != "code"}):
+        (tmp_path / SETTINGS).write_text(json.dumps(before))
+        assert experiment.main([*QUICK, "--out", str(tmp_path), "--jobs", "1"]) == 1
+        said = capsys.readouterr().err
+        assert f"{before.get('code', 'unknown')} there, {header['code']} now" in said and "--overwrite" in said
+    assert call(tmp_path, "--jobs", "1", "--overwrite")["code"] == header["code"]
+
+
+def test_the_fingerprint_tells_sources_apart(tmp_path: Path) -> None:
+    """Content and names count, what is no source and where it lies do not."""
+    hashes = []
+    for n, files in enumerate(({"a.py": "1"}, {"a.py": "1", "a.txt": "2"}, {"a.py": "2"}, {"b.py": "1"}, {})):
+        folder = tmp_path / str(n)
+        folder.mkdir()
+        for name, content in files.items():
+            (folder / name).write_text(content)
+        hashes.append(fingerprint.sources_hash([("package", folder)]))
+    assert hashes[0] == hashes[1] and len(set(hashes)) == 4
+    assert all(re.fullmatch("[0-9a-f]{12}", each) for each in hashes)
 
 
 def test_a_folder_that_is_none_of_ours_is_refused(tmp_path: Path) -> None:
     (tmp_path / SETTINGS).write_text("[1, 2]")
     with pytest.raises(ExperimentError, match="not of an experiment"):
-        RunStore(tmp_path, "kalman", KalmanSettings())
+        RunStore(tmp_path, "kalman", KalmanSettings(), CODE)
 
 
 def test_a_bad_line_is_named(tmp_path: Path) -> None:
-    RunStore(tmp_path, "kalman", KalmanSettings()).add(Repetition("calibrated", 0, {"mse": math.nan}, 0.1))
-    store = RunStore(tmp_path, "kalman", KalmanSettings())
+    RunStore(tmp_path, "kalman", KalmanSettings(), CODE).add(Repetition("calibrated", 0, {"mse": math.nan}, 0.1))
+    store = RunStore(tmp_path, "kalman", KalmanSettings(), CODE)
     assert math.isnan(store.values(["calibrated"], 1)["calibrated"]["mse"][0])
     with (tmp_path / REPETITIONS).open("a") as file:
         file.write("nonsense\n")
     with pytest.raises(ExperimentError, match=f"{REPETITIONS}:2"):
-        RunStore(tmp_path, "kalman", KalmanSettings())
+        RunStore(tmp_path, "kalman", KalmanSettings(), CODE)
 
 
 def test_what_is_wrong_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

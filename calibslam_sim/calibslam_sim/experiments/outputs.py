@@ -18,7 +18,13 @@ Values = Mapping[str, Mapping[str, Sequence[float]]]
 
 
 def result_of(
-    name: str, experiment: Experiment, settings: ExperimentSettings, values: Values, command: str, seconds: float
+    name: str,
+    experiment: Experiment,
+    settings: ExperimentSettings,
+    values: Values,
+    code: str,
+    command: str,
+    seconds: float,
 ) -> dict[str, Any]:
     """The content of result.json.
 
@@ -27,6 +33,7 @@ def result_of(
         experiment: it.
         settings: that were used.
         values: condition -> metric -> value of each repetition.
+        code: state of the code that made it.
         command: that made it.
         seconds: of computing, all repetitions together.
     """
@@ -50,6 +57,7 @@ def result_of(
             for metric, freedom in experiment.degrees_of_freedom.items()
         },
         **experiment.further(values),
+        "code": code,
         "command": command,
         "seconds": seconds,
     }

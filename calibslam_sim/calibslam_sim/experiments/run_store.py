@@ -1,4 +1,4 @@
-"""The folder of an experiment: its settings, and one line for each repetition of a condition that is done.
+"""The folder of an experiment: its settings, the state of the code, and a line for each repetition that is done.
 
 An interrupted experiment finds there what it need not do again.
 """
@@ -30,20 +30,30 @@ class Repetition:
 class RunStore:
     """What is done of an experiment, in a folder."""
 
-    def __init__(self, folder: Path, name: str, settings: ExperimentSettings, overwrite: bool = False) -> None:
+    def __init__(
+        self, folder: Path, name: str, settings: ExperimentSettings, code: str, overwrite: bool = False
+    ) -> None:
         """Begin in a new folder, or go on in one.
 
+        Args:
+            folder: of the experiment.
+            name: of the experiment.
+            settings: of the experiment.
+            code: which state of the code is running, see `fingerprint`.
+            overwrite: begin anew.
+
         Raises:
-            ExperimentError: the folder holds another experiment, or other settings.
+            ExperimentError: the folder holds another experiment, other settings, or what other code has computed.
         """
         self._lines = folder / REPETITIONS
         self._done: dict[tuple[str, int], Repetition] = {}
         path = folder / SETTINGS
+        header = {"experiment": name, "code": code, "settings": asdict(settings)}
         if overwrite:
             path.unlink(missing_ok=True)
             self._lines.unlink(missing_ok=True)
         if path.exists():
-            _check(path, name, asdict(settings))
+            _check(path, header)
             self._read()
             return
         folder.mkdir(parents=True, exist_ok=True)
@@ -51,7 +61,6 @@ class RunStore:
             raise ExperimentError(
                 f"{self._lines} exists without {SETTINGS}: choose another --out, or begin anew with --overwrite"
             )
-        header = {"experiment": name, "settings": asdict(settings)}
         path.write_text(json.dumps(header, indent=1) + "\n", encoding="utf-8")
 
     def missing(self, conditions: Iterable[str], repetitions: int) -> list[tuple[str, int]]:
@@ -96,8 +105,8 @@ class RunStore:
             self._done[repetition.condition, repetition.number] = repetition
 
 
-def _check(path: Path, name: str, settings: dict[str, Any]) -> None:
-    """Whether a file states this experiment with these settings.
+def _check(path: Path, wanted: dict[str, Any]) -> None:
+    """Whether a file states this experiment with these settings, and this code.
 
     Raises:
         ExperimentError: naming what differs.
@@ -105,15 +114,18 @@ def _check(path: Path, name: str, settings: dict[str, Any]) -> None:
     way_out = "choose another --out, or begin anew with --overwrite"
     try:
         header = json.loads(path.read_text(encoding="utf-8"))
-        there, before = header["experiment"], dict(header["settings"])
+        name, code, settings = header["experiment"], header.get("code", "unknown"), dict(header["settings"])
     except (ValueError, KeyError, TypeError):
         raise ExperimentError(f"{path} is not of an experiment: {way_out}") from None
-    if there != name:
-        raise ExperimentError(f"{path.parent} holds the experiment {there}: {way_out}")
+    if name != wanted["experiment"]:
+        raise ExperimentError(f"{path.parent} holds the experiment {name}: {way_out}")
+    now = wanted["settings"]
     differing = [
-        f"{key} = {before.get(key)!r} there, {settings.get(key)!r} now"
-        for key in sorted({*before, *settings})
-        if before.get(key) != settings.get(key)
+        f"{key} = {settings.get(key)!r} there, {now.get(key)!r} now"
+        for key in sorted({*settings, *now})
+        if settings.get(key) != now.get(key)
     ]
     if differing:
         raise ExperimentError(f"{path.parent} holds other settings ({'; '.join(differing)}): {way_out}")
+    if code != wanted["code"]:
+        raise ExperimentError(f"{path.parent} was made by other code ({code} there, {wanted['code']} now): {way_out}")

@@ -1,0 +1,129 @@
+"""Node `visual_odometry`: images and registered depth in, relative motions with covariance out.
+
+The executor's thread joins images and depth; one worker thread follows. Of pairs that wait only the newest stays, the
+others are counted as dropped: the next motion spans them.
+"""
+
+from __future__ import annotations
+
+import sys
+import threading
+import time
+from collections.abc import Sequence
+from typing import Any
+
+from calibslam_msgs.msg import RelativePose
+from rclpy.node import Node
+from sensor_msgs.msg import CameraInfo, CompressedImage, Image
+
+from calibslam_msgs_py.conversions import RosTypes, camera_from_msg, motion_to_msg
+from calibslam_msgs_py.measurements import InvalidMeasurement
+from calibslam_msgs_py.node import MEASUREMENT, SENSOR, Counters, run
+from calibslam_msgs_py.settings import declare_parameters
+from calibslam_sim.depth_camera import DepthCamera, DepthCameraSettings
+from calibslam_sim.image_pairs import Pair
+from calibslam_sim.visual_odometry import VisualOdometrySettings
+
+SECONDS_BETWEEN_WARNINGS = 5.0
+
+
+class VisualOdometryNode(Node):
+    """camera/image_raw and camera/depth/image_raw, or compressed, and camera/camera_info -> relative_pose."""
+
+    def __init__(self) -> None:
+        super().__init__("visual_odometry")
+        settings = declare_parameters(self, DepthCameraSettings)
+        self._camera = DepthCamera(settings, declare_parameters(self, VisualOdometrySettings))
+        self._types = RosTypes()
+        self._counters = Counters(self)
+        self._publisher = self.create_publisher(RelativePose, "relative_pose", MEASUREMENT)
+        self._newest: Pair[Any, Any] | None = None
+        self._arrived = threading.Condition()
+        self._stop = False
+        self._worker = threading.Thread(target=self._work, name="visual odometry", daemon=True)
+        self._worker.start()
+        self.create_subscription(CameraInfo, "camera/camera_info", self._receive_camera, SENSOR)
+        for kind, suffix in ((Image, ""), (CompressedImage, "/compressed")):
+            self.create_subscription(kind, f"camera/image_raw{suffix}", self._receive_image, SENSOR)
+        for kind, suffix in ((Image, ""), (CompressedImage, "/compressedDepth")):
+            self.create_subscription(kind, f"camera/depth/image_raw{suffix}", self._receive_depth, SENSOR)
+
+    # -- executor's thread --------------------------------------------------------------------------------------
+
+    def _receive_camera(self, message: Any) -> None:
+        try:
+            self._camera.set_camera(camera_from_msg(message))
+        except InvalidMeasurement as error:
+            self._reject(error)
+
+    def _receive_image(self, message: Any) -> None:
+        self._put(self._camera.add_image(message))
+
+    def _receive_depth(self, message: Any) -> None:
+        self._put(self._camera.add_depth(message))
+
+    def _put(self, pairs: list[Pair[Any, Any]]) -> None:
+        for reason, count in self._camera.rejected.items():
+            self._counters.count(f"rejected_{reason}", count)
+        self._camera.rejected.clear()
+        for pair in pairs:
+            with self._arrived:
+                if self._newest is not None:
+                    self._counters.count("dropped")
+                self._newest = pair
+                self._arrived.notify()
+
+    # -- worker's thread ----------------------------------------------------------------------------------------
+
+    def _work(self) -> None:
+        while True:
+            with self._arrived:
+                self._arrived.wait_for(lambda: self._newest is not None or self._stop)
+                pair, self._newest = self._newest, None
+            if self._stop or pair is None:
+                return
+            try:
+                self._follow(pair)
+            except InvalidMeasurement as error:
+                self._reject(error)
+            except Exception as error:  # the node goes on with the next image
+                self._counters.count("errors")
+                self.get_logger().error(f"{type(error).__name__}: {error}")
+
+    def _follow(self, pair: Pair[Any, Any]) -> None:
+        began = time.monotonic()
+        step = self._camera.step(pair)
+        self._counters.count("images")
+        self._counters.set("following_ms", f"{(time.monotonic() - began) * 1e3:.0f}")
+        if step is None:
+            return
+        self._publisher.publish(motion_to_msg(step.motion, self._types))
+        self._counters.count("motions")
+        self._counters.set("corners", step.corners)
+        self._counters.set("residual_px", f"{step.sigma:.2f}")
+        if step.bridged:
+            self._counters.count("bridged")
+            self.get_logger().warning(
+                "the camera was lost: too few corners with depth agree on a motion; its covariance says so",
+                throttle_duration_sec=SECONDS_BETWEEN_WARNINGS,
+            )
+
+    def _reject(self, error: InvalidMeasurement) -> None:
+        self._counters.count(f"rejected_{error.reason}")
+        self.get_logger().warning(f"left out: {error}", throttle_duration_sec=SECONDS_BETWEEN_WARNINGS)
+
+    def close(self) -> None:
+        """Let the worker end its image."""
+        with self._arrived:
+            self._stop = True
+            self._arrived.notify()
+        self._worker.join(timeout=10.0)
+
+
+def main(args: Sequence[str] | None = None) -> int:
+    """Runs the node; returns the exit code."""
+    return run(VisualOdometryNode, args)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
