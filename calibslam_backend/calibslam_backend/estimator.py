@@ -25,7 +25,7 @@ from calibslam_backend.association import GIVEN
 from calibslam_backend.box_measurement import undistorted
 from calibslam_backend.data_association import DataAssociation
 from calibslam_backend.estimator_settings import EstimatorSettings
-from calibslam_backend.graph import Motion, ObjectGraph
+from calibslam_backend.graph import Motion, ObjectGraph, UpdateReport
 from calibslam_backend.kernels import load_kernels
 from calibslam_backend.noise import QUADRICSLAM
 from calibslam_backend.object_map import ObjectMap
@@ -54,8 +54,9 @@ class Keyframe:
         T_map_camera: (4, 4) as known right after it.
         boxes: boxes that were given to quadrics.
         added, removed: ids of quadrics, since the keyframe before.
-        repaired: what had to be repaired; "" if nothing.
+        repaired: what had to be repaired since the keyframe before; "" if nothing.
         seconds: that it took.
+        between: the longest [s] that an image since the keyframe before took, which is none itself.
     """
 
     index: int
@@ -66,6 +67,7 @@ class Keyframe:
     removed: list[int]
     repaired: str
     seconds: float
+    between: float
 
 
 class Estimator:
@@ -73,7 +75,6 @@ class Estimator:
 
     SIGHTINGS_APART = SECOND // 5
     SIGHTINGS_AGREE = 0.2  # [rad, m]
-    PIECES = 4  # in which earlier keyframes are revised
     # At the end: rounds of association and optimisation, and when poses [rad, m] count as settled.
     ROUNDS, ITERATIONS_OF_A_ROUND, ITERATIONS, CONVERGED = 5, 2, 10, 1e-3
 
@@ -93,6 +94,8 @@ class Estimator:
         self._graph = ObjectGraph(self.camera.K, self.settings, self.settings, self.settings)
         self._objects = DataAssociation(self._graph, self.camera, self.settings, self.counts)
         self._known: Set[int] = set()  # quadrics after the last keyframe
+        self._repairs: list[str] = []
+        self._between = 0.0
         self._chores: list[Callable[[], object]] = []
         self._searching = False
         self._sighting: tuple[int, Array] | None = None  # where a camera that searches was seen last
@@ -162,7 +165,7 @@ class Estimator:
     def _converge(self, iterations: int) -> None:
         for _ in range(iterations):
             before = self._graph.poses()
-            self._objects.note(self._graph.iterate())
+            self._note(self._graph.iterate())
             if np.abs(self._graph.poses() - before).max() < self.CONVERGED:
                 break
 
@@ -295,6 +298,7 @@ class Estimator:
             if not self._moved(motion.T, boxes.stamp - self.stamps[-1]):
                 if self._chores:
                     self._chores.pop(0)()
+                self._between = max(self._between, time.perf_counter() - began)
                 return None
         return self._keyframe(boxes, tracks, motion, found, began)
 
@@ -346,16 +350,27 @@ class Estimator:
 
     def _chores_of(self, k: int) -> list[Callable[[], object]]:
         """What keyframe k leaves to be done: each a piece of work for one image."""
-        objects, settings = self._objects, self.settings
-        chores: list[Callable[[], object]] = [lambda: objects.relocalise(k)] if k else []
-        chores.append(lambda: objects.start_quadrics(objects.frames[k].tracks))
-        chores += [lambda: objects.revise(-(-settings.revised // self.PIECES))] * self.PIECES
-        return [*chores, self._settle]
+        objects = self._objects
+
+        def look_for_known_and_new() -> None:
+            if k:
+                objects.relocalise(k)
+            objects.start_quadrics(objects.frames[k].tracks)
+
+        def revise() -> None:
+            objects.revise(-(-self.settings.revised // 2))
+
+        return [look_for_known_and_new, revise, revise, self._settle]
 
     def _settle(self) -> None:
         report = self._graph.settle()
         if report is not None:
-            self._objects.note(report)
+            self._note(report)
+
+    def _note(self, report: UpdateReport) -> None:
+        self._objects.note(report)
+        if report.repaired:
+            self._repairs.append(report.repaired)
 
     def _keyframe(
         self, boxes: Boxes, tracks: list[int], motion: Motion | None, found: Relocalised | None, began: float
@@ -378,11 +393,12 @@ class Estimator:
             objects.bind_found(frame, found)
         if motion is not None:
             objects.vote(k, motion.covariance)
-        report = self._graph.update()
-        self._objects.note(report)
+        self._note(self._graph.update())
         objects.merge()
         self._chores = self._chores_of(k)
         self._known = set(self._graph.landmarks)
+        repaired, self._repairs = "; ".join(self._repairs), []
+        between, self._between = self._between, 0.0
         return Keyframe(
             k,
             boxes.stamp,
@@ -390,6 +406,7 @@ class Estimator:
             used,
             sorted(self._known - before),
             sorted(before - self._known),
-            report.repaired,
+            repaired,
             time.perf_counter() - began,
+            between,
         )

@@ -87,9 +87,9 @@ class Revision:
 
 @numba.njit(cache=True)
 def squared_distances(T, quadrics, surfaces, K, size, corners, whiteners, bounds, clip, model_error):  # type: ignore[no-untyped-def]
-    """(M, N) squared Mahalanobis distance of N boxes to those of M quadrics with these `shapes`; infinite if they do not
-    overlap.
+    """(M, N) squared Mahalanobis distance of N boxes to those of M quadrics, whose surfaces are their `shapes`.
 
+    Infinite if they do not overlap.
     The covariance is that of the measurement and that of the ellipsoid as a model of the object.
     """
     result = np.full((len(quadrics), len(corners)), np.inf)

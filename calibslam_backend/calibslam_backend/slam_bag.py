@@ -135,6 +135,7 @@ def run_record(
         odometry=estimator.odometry(),
         online=np.reshape([keyframe.T_map_camera for keyframe in keyframes], (-1, 4, 4)),
         seconds=np.array([keyframe.seconds for keyframe in keyframes]),
+        between=np.array([keyframe.between for keyframe in keyframes]),
         boxes_used=estimator.boxes_used,
         boxes_rejected=sum(rejections.values()),
         rejected={**rejections, **{k: n for k, n in counts.items() if not k.startswith("rejected_")}},
