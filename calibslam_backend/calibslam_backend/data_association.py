@@ -18,6 +18,7 @@ from calibslam_backend.association import (
     Prediction,
     Votes,
     assign,
+    at_one_place,
     distances,
     predict,
     predicted_corners,
@@ -365,15 +366,21 @@ class DataAssociation:
             return gone
         vectors = np.stack([self._graph.quadric(j) for j in ids])
         for m in reversed(range(len(ids))):
-            # An older quadric of its place, size and class, never seen beside it, is the same object.
-            for n in np.flatnonzero(same_object(vectors[m], vectors[:m], self.settings.merge_distance)):
+            # An older quadric of its place, size and class, never seen beside it, is the same object; if they have settled
+            # at one place, also one that was.
+            inside = at_one_place(vectors[m], vectors[:m]) & (self._is_settled(ids[m]))
+            for n in np.flatnonzero(same_object(vectors[m], vectors[:m], self.settings.merge_distance) | inside):
                 j, older = ids[m], ids[n]
                 boxes, others = (self._graph.landmarks[i].boxes.keys() for i in (j, older))
-                if self.class_of_quadric(older) == self.class_of_quadric(j) and not _apart(boxes, others):
+                alike = self.class_of_quadric(older) == self.class_of_quadric(j)
+                if alike and (inside[n] or not _apart(boxes, others)):
                     self._unite(j, older)
                     gone.append(j)
                     break
         return gone
+
+    def _is_settled(self, j: int) -> bool:
+        return len(self.frames) - self._graph.landmarks[j].born > self.YOUNG
 
     def spread_over_all(self) -> None:
         """Covariances of boxes from the spread of all boxes of their quadric, not of those so far (eq. 4.3.1)."""
