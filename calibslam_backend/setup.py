@@ -14,6 +14,8 @@ setup(
         ("share/ament_index/resource_index/packages", [f"resource/{PACKAGE}"]),
         (f"share/{PACKAGE}", ["package.xml"]),
         (f"share/{PACKAGE}/config", sorted(glob("config/*.yaml"))),
+        (f"share/{PACKAGE}/rviz", sorted(glob("rviz/*.rviz"))),
+        (f"share/{PACKAGE}/foxglove", sorted(glob("foxglove/*.json"))),
     ],
     package_data={PACKAGE: ["py.typed"]},
     install_requires=["setuptools"],

@@ -25,8 +25,10 @@ setup(
     entry_points={
         "console_scripts": [
             f"demo = {PACKAGE}.demo:main",
+            f"draw_run = {PACKAGE}.draw_run:main",
             f"evaluate = {PACKAGE}.evaluate:main",
             f"experiment = {PACKAGE}.experiment:main",
+            f"export_rerun = {PACKAGE}.export_rerun:main",
             f"odometry = {PACKAGE}.odometry_node:main",
             f"parameters = {PACKAGE}.parameters:main",
             f"play = {PACKAGE}.play_node:main",

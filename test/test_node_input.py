@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from calibslam_msgs.msg import BoundingBoxArray, RelativePose
+from calibslam_msgs.msg import BoundingBox, BoundingBoxArray, RelativePose
 from calibslam_msgs.srv import LoadMap, SaveMap
 from live import Process, Watcher, random_domain, trajectory_of, wait_until
 from nav_msgs.msg import Path as PathMessage
@@ -75,9 +75,10 @@ class Robot:
 
 
 @pytest.fixture
-def robot() -> Iterator[Robot]:
+def robot(tmp_path: Path) -> Iterator[Robot]:
     domain = random_domain()
-    with Watcher(domain) as watcher, Process(domain, "calibslam_backend", "backend") as backend:
+    options = ("--ros-args", "-p", f"map_folder:={tmp_path}")
+    with Watcher(domain) as watcher, Process(domain, "calibslam_backend", "backend", *options) as backend:
         yield Robot(watcher)
         assert backend.running, backend.output
         assert backend.end() == 0, backend.output
@@ -118,17 +119,53 @@ def test_bad_input_is_counted_and_the_graph_goes_on(robot: Robot) -> None:
     robot.boxes(boxes[53], other_size)
     robot.motion(motions[52], infinite)
     robot.motion(motions[52], indefinite_motion)
-    robot.motion(motions[10])  # time goes backwards
+    robot.motion(motions[10])  # a single one of long ago
     robot.motion(replace(motions[52], start=motions[52].end + 1, end=motions[52].end + 2), reversed_time)
-    robot.boxes(boxes[20])
+    robot.boxes(boxes[45])
     robot.boxes(boxes[52])
     robot.expect(
         rejected_box_nan=1, rejected_box_covariance=2, rejected_box_outside=1, rejected_image_size=1, rejected_pose=1,
-        rejected_covariance=1, rejected_overlap=1, rejected_time=1, rejected_late=1, rejected_duplicate=1, images=53,
+        rejected_covariance=1, rejected_time=1, rejected_late=1, rejected_duplicate=1, images=53,
     )  # fmt: skip
     robot.drive(53, 150)
-    robot.expect(images=150, motions=149)
+    robot.expect(images=150, motions=149, rejected_time_jump=1)
     wait_until(lambda: ate(trajectory_of(robot.watcher.last["/trajectory"]), WORLD.truth()) < 0.04, "a good trajectory")
+    assert "errors" not in robot.watcher.counts("/backend")
+
+
+def test_a_peer_that_publishes_garbage(robot: Robot) -> None:
+    """Bytes that are no message, far too many boxes, names that are none, another camera: counted, and nothing more."""
+    boxes, motions = WORLD.boxes(), WORLD.motions()
+    peer = robot.watcher.node.create_publisher(BoundingBoxArray, "detections", MEASUREMENT)
+    other = robot.watcher.node.create_publisher(RelativePose, "relative_pose", MEASUREMENT)
+    for publisher in (peer, other):
+        wait_until(lambda p=publisher: p.get_subscription_count() == 1, "the back end does not subscribe")
+    robot.camera()
+    robot.drive(0, 40)
+    robot.expect(images=40)
+    for data in (b"\0\1\0\0", b"\0\1\0\0" + b"\xff" * 200, b"\0\1\0\0" + b"\0" * 16 + b"\xff\xff\xff\x7f" * 9):
+        peer.publish(data)
+        other.publish(data)
+    peer.publish(BoundingBoxArray())
+    peer.publish(BoundingBoxArray(width=640, height=480, boxes=[BoundingBox()] * 10_000))
+    other.publish(RelativePose())
+    robot.expect(rejected_undecodable=6, rejected_message_size=1, rejected_image_size=1, rejected_time=1)
+
+    def foreign(message: Any) -> None:
+        message.header.frame_id = "another camera"
+
+    def nameless(message: Any) -> None:
+        message.header.frame_id = ""
+        for box in message.boxes:
+            box.class_id = box.object_id = ""
+
+    robot.motion(motions[39], foreign)
+    robot.motion(motions[39])
+    robot.boxes(boxes[40], foreign)
+    robot.boxes(boxes[40], nameless)
+    robot.expect(rejected_frame=2, images=41)
+    robot.drive(41, 150)
+    robot.expect(images=150, motions=149)
     assert "errors" not in robot.watcher.counts("/backend")
 
 

@@ -29,6 +29,7 @@ from calibslam_backend.box_measurement import BoxMeasurement, prepare, stacked
 from calibslam_backend.estimator_settings import EstimatorSettings
 from calibslam_backend.graph import ObjectGraph, UpdateReport
 from calibslam_backend.initialisation import initialise
+from calibslam_backend.innovation import innovations
 from calibslam_backend.localisation import localise
 from calibslam_backend.noise import NoiseModel, spread
 from calibslam_backend.relocalisation import Relocalised, relocalise
@@ -134,6 +135,17 @@ class DataAssociation:
         s = self.settings
         quadrics, boxes = [vector for vector, _ in known], [box for _, box in known]
         return localise(predicted, covariance, quadrics, boxes, self.camera.K, s.robust_scale, s.robust_odometry)
+
+    def innovations(self, frame: Frame, predicted: Array, covariance: Array) -> Array:
+        """Normalised innovations squared of the boxes of bound tracks; arguments as in `localise`."""
+        bound = [(self._candidates[t].quadric, box) for t, box in zip(frame.tracks, frame.boxes, strict=True)]
+        known = [(j, box) for j, box in bound if j is not None and self._graph.is_solved(j)]
+        ids = sorted({j for j, _ in known})
+        joint = dict(zip(ids, self._graph.joint_covariances(len(self.frames) - 1, ids), strict=True))
+        for each in joint.values():
+            each[:6, :6] += covariance
+        vectors, boxes = [self._graph.quadric(j) for j, _ in known], [box for _, box in known]
+        return innovations(predicted, vectors, [joint[j] for j, _ in known], boxes, self.camera.K)
 
     def add(self, frame: Frame) -> int:
         """The boxes of the newest keyframe; those of bound tracks go to their quadrics. Returns how many."""
@@ -366,9 +378,9 @@ class DataAssociation:
             return gone
         vectors = np.stack([self._graph.quadric(j) for j in ids])
         for m in reversed(range(len(ids))):
-            # An older quadric of its place, size and class, never seen beside it, is the same object; if they have settled
-            # at one place, also one that was.
-            inside = at_one_place(vectors[m], vectors[:m]) & (self._is_settled(ids[m]))
+            # An older quadric of its place, size and class, never seen beside it, is the same object; even one that was
+            # seen beside it, if both have settled at one place.
+            inside = at_one_place(vectors[m], vectors[:m]) & self._is_settled(ids[m])
             for n in np.flatnonzero(same_object(vectors[m], vectors[:m], self.settings.merge_distance) | inside):
                 j, older = ids[m], ids[n]
                 boxes, others = (self._graph.landmarks[i].boxes.keys() for i in (j, older))

@@ -57,6 +57,7 @@ class Keyframe:
         repaired: what had to be repaired since the keyframe before; "" if nothing.
         seconds: that it took.
         between: the longest [s] that an image since the keyframe before took, which is none itself.
+        nis: normalised innovations squared of its boxes, see `innovation`; empty for most keyframes.
     """
 
     index: int
@@ -68,6 +69,7 @@ class Keyframe:
     repaired: str
     seconds: float
     between: float
+    nis: Array
 
 
 class Estimator:
@@ -75,6 +77,8 @@ class Estimator:
 
     SIGHTINGS_APART = SECOND // 5
     SIGHTINGS_AGREE = 0.2  # [rad, m]
+    START_ERROR = 1.0  # [rad, m] of a start pose that is given
+    NIS_EVERY = 10  # keyframes, since it takes about as long as half an update's votes
     # At the end: rounds of association and optimisation, and when poses [rad, m] count as settled.
     ROUNDS, ITERATIONS_OF_A_ROUND, ITERATIONS, CONVERGED = 5, 2, 10, 1e-3
 
@@ -99,6 +103,7 @@ class Estimator:
         self._chores: list[Callable[[], object]] = []
         self._searching = False
         self._sighting: tuple[int, Array] | None = None  # where a camera that searches was seen last
+        self._start: Array | None = None  # where it is said to be
         self._given: dict[str, int] = {}
         self._waiting: list[tuple[int, int, Boxes]] = []
         self._last_frame: int | None = None
@@ -148,6 +153,12 @@ class Estimator:
     def waiting(self) -> int:
         """Images for which odometry has not come yet."""
         return len(self._waiting)
+
+    def limit_waiting(self, limit: int) -> int:
+        """Leave out the latest images that wait for odometry beyond so many; returns how many."""
+        dropped = max(len(self._waiting) - limit, 0)
+        del self._waiting[limit:]
+        return dropped
 
     def finish(self) -> None:
         """Associate and relinearise until nothing changes any more: the best estimate of all that was seen."""
@@ -251,6 +262,23 @@ class Estimator:
             classes = Counter({quadric.class_id: max(quadric.observations, 1)})
             self._objects.know(quadric.id, vector, covariance, classes)
 
+    def begin_again(self, keep_map: bool) -> None:
+        """Forget the trajectory, and the objects unless the map is kept: then as in a loaded map."""
+        known = tuple(self.quadrics()) if keep_map else ()
+        self.load(ObjectMap((), np.zeros((0, 4, 4)), np.zeros((0, 6, 6)), known, self.camera.frame_id))
+
+    def start_at(self, T_map_body: Array) -> None:
+        """Begin a trajectory in the map there is, where the body is said to be: (4, 4), right to about half a metre.
+
+        Raises:
+            InvalidMeasurement: "start_pose", if there is no map.
+        """
+        if not self.objects:
+            raise InvalidMeasurement("start_pose", "there is no map yet that a start pose could be in")
+        if self.stamps:
+            self.begin_again(keep_map=True)
+        self._start = T_map_body @ self._T_body_camera
+
     def associations(self) -> list[tuple[int | None, str]]:
         """For each box of a keyframe the quadric it is given to, and its true identity ("": unknown)."""
         frames = self._objects.frames
@@ -285,7 +313,9 @@ class Estimator:
         self._last_frame = boxes.stamp
         boxes, tracks = self._tracks(boxes, turned)
         motion = found = None
-        if self._searching:
+        if self._start is not None:
+            found, self._start, self._searching = self._near_start(boxes, tracks, self._start), None, False
+        elif self._searching:
             found = self._find(boxes, tracks)
             if found is None:
                 self.counts["images_not_found"] += 1
@@ -372,6 +402,15 @@ class Estimator:
         if report.repaired:
             self._repairs.append(report.repaired)
 
+    def _near_start(self, boxes: Boxes, tracks: list[int], start: Array) -> Relocalised:
+        """Where the camera is found near the pose (4, 4) that it is said to have, or that pose."""
+        found = self._objects.find(self._objects.frame(boxes, tracks))
+        if found is not None:
+            difference = gtsam.Pose3(start).localCoordinates(gtsam.Pose3(found.T_map_camera))
+            if np.abs(difference).max() < self.START_ERROR:
+                return found
+        return Relocalised(start, [])
+
     def _keyframe(
         self, boxes: Boxes, tracks: list[int], motion: Motion | None, found: Relocalised | None, began: float
     ) -> Keyframe:
@@ -381,10 +420,14 @@ class Estimator:
         objects = self._objects
         frame = objects.frame(boxes, tracks)
         k = len(self.stamps)
+        nis = np.zeros(0)
         if motion is None:
             self._graph.add_origin(None if found is None else found.T_map_camera)
         else:
-            guess = objects.localise(frame, self._graph.predict(motion), motion.covariance)
+            predicted = self._graph.predict(motion)
+            if k % self.NIS_EVERY == 0:
+                nis = objects.innovations(frame, predicted, motion.covariance)
+            guess = objects.localise(frame, predicted, motion.covariance)
             self._graph.add_pose(motion, guess)
         self.stamps.append(boxes.stamp)
         self._motions.forget_before(boxes.stamp)
@@ -409,4 +452,5 @@ class Estimator:
             repaired,
             time.perf_counter() - began,
             between,
+            nis,
         )

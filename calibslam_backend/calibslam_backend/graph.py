@@ -304,22 +304,20 @@ class ObjectGraph:
         s = self._settings
         poses = _poses(self._smoother.values)
         moved = np.abs(poses - self._linearised).max(axis=(1, 2)) > s.relinearise_pose
-        names: dict[Hashable, None] = {}  # in a fixed order
+        names: dict[Hashable, None] = {}  # each once, in a fixed order
         for k in turn:
             if moved[k]:
-                names.update({("motion", k): None} if k else {})
-                names.update({("motion", k + 1): None} if k + 1 < len(moved) else {})
+                names["motion", k] = names["motion", k + 1] = None
         for j, landmark in self.landmarks.items():
             vector = self.quadric(j)
             young = self.size - landmark.born <= s.young
-            for k in landmark.boxes if young else turn:
-                if k in landmark.boxes and (
-                    moved[k] or np.abs(vector - landmark.linearised[k]).max() > s.relinearise_quadric
-                ):
+            for k in landmark.boxes if young else [k for k in turn if k in landmark.boxes]:
+                if moved[k] or np.abs(vector - landmark.linearised[k]).max() > s.relinearise_quadric:
                     landmark.linearised[k] = vector
                     names["box", k, j] = None
-        for k in np.flatnonzero(moved[turn.start : turn.stop]) + turn.start:
-            self._linearised[k] = poses[k]
+        for k in turn:
+            if moved[k]:
+                self._linearised[k] = poses[k]
         for name in names:
             self._smoother.renew(name)
         return len(names)

@@ -57,10 +57,10 @@ class MapToOdom:
             return
         from nav_msgs.msg import Odometry
 
-        from calibslam_msgs_py.node import MEASUREMENT
+        from calibslam_msgs_py.node import MEASUREMENT_INPUT
 
         self._publisher = node.create_publisher(TFMessage, "/tf", 100)
-        node.create_subscription(Odometry, "odom", self._receive, MEASUREMENT)
+        node.create_subscription(Odometry, "odom", self._receive, MEASUREMENT_INPUT)
 
     def _receive(self, message: Any) -> None:
         from calibslam_msgs_py.conversions import odometry_from_msg

@@ -39,6 +39,16 @@ class ObjectMap:
 
     def save(self, path: Path) -> None:
         """Write it as JSON; the same map gives the same bytes. An existing file is replaced in one step."""
+        partial = path.with_name(path.name + ".part")
+        try:
+            partial.write_text(self.to_json(), encoding="utf-8")
+            partial.replace(path)
+        except OSError:
+            partial.unlink(missing_ok=True)
+            raise
+
+    def to_json(self) -> str:
+        """As it stands in a file."""
         keyframes = [
             {"stamp": stamp, **_pose(T), "covariance": covariance.ravel().tolist()}
             for stamp, T, covariance in zip(self.stamps, self.poses, self.covariances, strict=True)
@@ -63,9 +73,7 @@ class ObjectMap:
             "quadrics": quadrics,
             "keyframes": keyframes,
         }
-        partial = path.with_name(path.name + ".part")
-        partial.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
-        partial.replace(path)
+        return json.dumps(content, indent=1) + "\n"
 
     @classmethod
     def load(cls, path: Path) -> ObjectMap:
@@ -74,11 +82,22 @@ class ObjectMap:
         Raises:
             MapFileError: the file is missing, is no map, or holds numbers that cannot be.
         """
+        if path.exists() and not (path.is_file() or path.is_dir()):  # a pipe would wait for ever
+            raise MapFileError(f"map {path} cannot be read: it is no file")
         try:
-            content = json.loads(path.read_text(encoding="utf-8"))
+            text = path.read_text(encoding="utf-8")
         except OSError as error:
             raise MapFileError(f"map {path} cannot be read: {error.strerror}") from None
         except ValueError as error:
+            raise MapFileError(f"map {path} is not JSON: {error}") from None
+        return cls.from_json(text, str(path))
+
+    @classmethod
+    def from_json(cls, text: str, path: str) -> ObjectMap:
+        """The map in a text that came from somewhere; raises MapFileError as `load`."""
+        try:
+            content = json.loads(text)
+        except (ValueError, RecursionError) as error:
             raise MapFileError(f"map {path} is not JSON: {error}") from None
         if not isinstance(content, dict) or content.get("format") != FORMAT:
             raise MapFileError(f'map {path} does not say "format": "{FORMAT}"; is it a map.json of this project?')

@@ -15,6 +15,7 @@ from calibslam_msgs_py.conversions import (
     pose_to_msg,
     pose_with_covariance_to_msg,
     quadrics_to_msg,
+    transform_to_msg,
 )
 from calibslam_msgs_py.measurements import Array, QuadricEstimate, StampedPose
 
@@ -27,43 +28,53 @@ TOPICS = {
     MARKERS: "visualization_msgs/msg/MarkerArray",
 }
 
+# In `run.mcap` only: there is no odometry frame between. Live, map -> odom is published (see map_to_odom_node).
+TRANSFORM = "tf"
+
 # visualization_msgs/Marker
 SPHERE, TEXT, ADD, DELETE_ALL = 2, 9, 0, 3
 
 
-def pose_message(estimator: Estimator, types: MessageTypes) -> Any:
-    """The newest keyframe with its covariance."""
+def pose_message(estimator: Estimator, types: MessageTypes, frame: str = MAP) -> Any:
+    """The newest keyframe with its covariance, in a frame of this name."""
     k = len(estimator.stamps) - 1
     pose = StampedPose(estimator.stamps[k], estimator.pose(k))
-    return pose_with_covariance_to_msg(pose, estimator.pose_covariance(k), MAP, types)
+    return pose_with_covariance_to_msg(pose, estimator.pose_covariance(k), frame, types)
 
 
-def map_messages(estimator: Estimator, types: MessageTypes) -> Iterator[tuple[str, Any]]:
+def camera_transform_message(estimator: Estimator, camera_frame: str, types: MessageTypes) -> Any:
+    """The newest keyframe as the transform map -> camera, so that what the camera sees can be shown in the map."""
+    k = len(estimator.stamps) - 1
+    return transform_to_msg(StampedPose(estimator.stamps[k], estimator.pose(k)), MAP, camera_frame or "camera", types)
+
+
+def map_messages(estimator: Estimator, types: MessageTypes, frame: str = MAP) -> Iterator[tuple[str, Any]]:
     """Trajectory, quadrics and their markers, as (topic, message)."""
     stamp = estimator.stamps[-1]
     poses = [StampedPose(t, T) for t, T in zip(estimator.stamps, estimator.trajectory(), strict=True)]
     quadrics = estimator.quadrics()
-    yield TRAJECTORY, path_to_msg(poses, MAP, types)
-    yield QUADRICS, quadrics_to_msg(stamp, quadrics, types, MAP)
-    yield MARKERS, markers_message(stamp, quadrics, types)
+    yield TRAJECTORY, path_to_msg(poses, frame, types)
+    yield QUADRICS, quadrics_to_msg(stamp, quadrics, types, frame)
+    yield MARKERS, markers_message(stamp, quadrics, types, frame)
 
 
-def markers_message(stamp: int, quadrics: Sequence[QuadricEstimate], types: MessageTypes) -> Any:
+def markers_message(stamp: int, quadrics: Sequence[QuadricEstimate], types: MessageTypes, frame: str = MAP) -> Any:
     """Quadrics as ellipsoids with their class names; the first marker removes those of before."""
-    markers = [_marker(stamp, "", 0, ADD, np.eye(4), np.zeros(3), "", types)]
+    header = header_to_msg(stamp, frame, types)
+    markers = [_marker(header, "", 0, ADD, np.eye(4), np.zeros(3), "", types)]
     markers[0].action = DELETE_ALL
     for quadric in quadrics:
         T, colour = quadric.T_map_object, _colour(quadric.class_id)
         label = np.eye(4)
         label[:3, 3] = T[:3, 3]
-        markers.append(_marker(stamp, "quadrics", quadric.id, SPHERE, T, 2.0 * quadric.radii, "", types, colour))
+        markers.append(_marker(header, "quadrics", quadric.id, SPHERE, T, 2.0 * quadric.radii, "", types, colour))
         text = f"{quadric.class_id} {quadric.id}"
-        markers.append(_marker(stamp, "labels", quadric.id, TEXT, label, np.full(3, 0.06), text, types))
+        markers.append(_marker(header, "labels", quadric.id, TEXT, label, np.full(3, 0.06), text, types))
     return types("visualization_msgs/msg/MarkerArray")(markers=markers)
 
 
 def _marker(
-    stamp: int,
+    header: Any,
     namespace: str,
     number: int,
     kind: int,
@@ -77,7 +88,7 @@ def _marker(
     empty = types("std_msgs/msg/ColorRGBA")
     red, green, blue = colour
     fields = {
-        "header": header_to_msg(stamp, MAP, types),
+        "header": header,
         "ns": namespace,
         "id": int(number),
         "type": kind,

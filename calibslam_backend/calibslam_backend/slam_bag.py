@@ -14,7 +14,7 @@ import numpy as np
 
 from calibslam_backend.estimator import Estimator, EstimatorSettings, Keyframe
 from calibslam_backend.object_map import ObjectMap
-from calibslam_backend.published import POSE, map_messages, pose_message
+from calibslam_backend.published import POSE, TRANSFORM, camera_transform_message, map_messages, pose_message
 from calibslam_backend.recording import Recording
 from calibslam_backend.run_folder import RunRecord, write_run
 from calibslam_backend.transform import transform_from_text
@@ -97,6 +97,8 @@ def slam_bag(
             for keyframe in new:
                 keyframes.append(keyframe)
                 writer.write(f"/{POSE}", pose_message(estimator, bags.types), keyframe.stamp)
+                transform = camera_transform_message(estimator, recording.camera.frame_id, bags.types)
+                writer.write(f"/{TRANSFORM}", transform, keyframe.stamp)
                 if keyframe.stamp >= next_map:
                     next_map = keyframe.stamp + int(MAP_PERIOD * SECOND)
                     for topic, message in map_messages(estimator, bags.types):

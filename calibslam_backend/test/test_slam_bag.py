@@ -10,6 +10,8 @@ from typing import Any
 import numpy as np
 import pytest
 from evo.tools import file_interface
+from mcap.reader import make_reader
+from mcap_ros2.decoder import DecoderFactory
 from rosbags.rosbag2 import StoragePlugin, Writer
 from small_bag import WORLD, Message, messages, write
 
@@ -70,7 +72,7 @@ def test_a_run_folder(bag: Path, tmp_path: Path, capsys: pytest.CaptureFixture[s
 def test_run_mcap_holds_what_is_published(bag: Path, tmp_path: Path) -> None:
     run(bag, tmp_path / "run")
     with BagReader(tmp_path / "run" / "run.mcap") as result:
-        assert set(result.topics) == {"/trajectory", "/pose", "/quadrics", "/quadric_markers"}
+        assert set(result.topics) == {"/trajectory", "/pose", "/quadrics", "/quadric_markers", "/tf"}
         last = {topic: message for topic, _, message in result.messages(list(result.topics))}
         keyframes = result.counts["/pose"]
     known = ObjectMap.load(tmp_path / "run" / "map.json")
@@ -82,6 +84,31 @@ def test_run_mcap_holds_what_is_published(bag: Path, tmp_path: Path) -> None:
         assert (a.id, a.class_id, a.observations) == (b.id, b.class_id, b.observations)
         np.testing.assert_allclose(a.T_map_object, b.T_map_object, atol=1e-9)
     assert len(last["/quadric_markers"].markers) == 1 + 2 * 9
+
+
+def test_run_mcap_opens_elsewhere(bag: Path, tmp_path: Path) -> None:
+    """By a reader that knows nothing but the file: every definition is inside, and the camera stands in the map."""
+    run(bag, tmp_path / "run")
+    messages: dict[str, list[Any]] = {}
+    with (tmp_path / "run" / "run.mcap").open("rb") as file:
+        reader = make_reader(file, decoder_factories=[DecoderFactory()])
+        for schema, channel, _, message in reader.iter_decoded_messages():
+            assert (schema.encoding, channel.message_encoding) == ("ros2msg", "cdr")
+            messages.setdefault(channel.topic, []).append(message)
+    assert set(messages) == {"/trajectory", "/pose", "/quadrics", "/quadric_markers", "/tf"}
+    assert len(messages["/tf"]) == len(messages["/pose"])
+    for transforms, pose in zip(messages["/tf"], messages["/pose"], strict=True):
+        (transform,) = transforms.transforms
+        assert (transform.header.frame_id, transform.child_frame_id) == ("map", "camera")
+        stamps = [(header.stamp.sec, header.stamp.nanosec) for header in (transform.header, pose.header)]
+        assert stamps[0] == stamps[1]
+        for part, same in (("translation", "position"), ("rotation", "orientation")):
+            there, here = getattr(transform.transform, part), getattr(pose.pose.pose, same)
+            assert all(getattr(there, axis) == getattr(here, axis) for axis in "xyzw" if hasattr(here, axis))
+    for topic in ("/trajectory", "/pose", "/quadrics"):
+        assert {message.header.frame_id for message in messages[topic]} == {"map"}
+    markers = [marker for message in messages["/quadric_markers"] for marker in message.markers]
+    assert {marker.header.frame_id for marker in markers} == {"map"}
 
 
 @pytest.mark.parametrize("options", [[], ["--association", "given", "--noise-model", "fixed"], ["--batch"]], ids=str)

@@ -17,10 +17,8 @@ from rclpy.node import Node
 from calibslam_detector.calibrator import CalibratorError, load
 from calibslam_msgs_py.conversions import RosTypes, boxes_from_msg, boxes_to_msg, valid_boxes
 from calibslam_msgs_py.measurements import InvalidMeasurement
-from calibslam_msgs_py.node import MEASUREMENT, MEASUREMENT_INPUT, Counters, run
+from calibslam_msgs_py.node import MEASUREMENT, MEASUREMENT_INPUT, Counters, advertise, run, subscribe
 from calibslam_msgs_py.settings import Settings, SettingsError, declare_parameters, setting
-
-SECONDS_BETWEEN_WARNINGS = 5.0
 
 
 @dataclass(frozen=True)
@@ -42,24 +40,21 @@ class CalibratorNode(Node):
             raise SettingsError(str(error)) from error
         self._types = RosTypes()
         self._counters = Counters(self)
-        self._publisher = self.create_publisher(BoundingBoxArray, "detections", MEASUREMENT)
-        self.create_subscription(BoundingBoxArray, "detections_raw", self._receive, MEASUREMENT_INPUT)
+        self._publisher = advertise(self, BoundingBoxArray, "detections", MEASUREMENT)
+        subscribe(self, self._counters, BoundingBoxArray, "detections_raw", self._receive, MEASUREMENT_INPUT)
 
     def _receive(self, message: Any) -> None:
         try:
             boxes, rejected = valid_boxes(boxes_from_msg(message))
         except InvalidMeasurement as error:
-            self._reject(error.reason, 1, f"image left out: {error}")
+            self._counters.reject(error)
             return
+        self._counters.arrived("detections_raw", boxes.stamp)
         for reason, count in rejected.items():
-            self._reject(reason, count, f"{count} boxes left out: {reason}")
+            self._counters.reject(InvalidMeasurement(reason, f"{count} boxes: {reason}"), count)
         self._publisher.publish(boxes_to_msg(self._calibrate(boxes), self._types))
         self._counters.count("images")
         self._counters.count("boxes", len(boxes))
-
-    def _reject(self, reason: str, count: int, text: str) -> None:
-        self._counters.count(f"rejected_{reason}", count)
-        self.get_logger().warning(text, throttle_duration_sec=SECONDS_BETWEEN_WARNINGS)
 
 
 def main(args: Sequence[str] | None = None) -> int:

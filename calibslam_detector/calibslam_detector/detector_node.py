@@ -27,6 +27,7 @@ from calibslam_detector.weights_file import SHIPPED, WeightsError
 from calibslam_msgs_py.conversions import RosTypes, boxes_to_msg, header_to_msg, stamp_from_msg, valid_boxes
 from calibslam_msgs_py.measurements import InvalidMeasurement
 from calibslam_msgs_py.node import MEASUREMENT, SENSOR, Counters, run
+from calibslam_msgs_py.node_sensors import SensorSubscription
 from calibslam_msgs_py.settings import Settings, SettingsError, declare_parameters, setting
 
 SECONDS_BETWEEN_WARNINGS = 5.0
@@ -74,8 +75,10 @@ class DetectorNode(Node):
         self._strange: deque[bool] = deque(maxlen=STRANGE_WINDOW)
         self._worker = threading.Thread(target=self._work, name="detector", daemon=True)
         self._worker.start()
-        self.create_subscription(Image, "camera/image_raw", self._receive_raw, SENSOR)
-        self.create_subscription(CompressedImage, "camera/image_raw/compressed", self._receive_compressed, SENSOR)
+        self._images = [
+            SensorSubscription(self, Image, "camera/image_raw", self._receive_raw),
+            SensorSubscription(self, CompressedImage, "camera/image_raw/compressed", self._receive_compressed),
+        ]
         self.get_logger().info(f"detecting {', '.join(self._detector.class_names)} on {self._detector.device}")
 
     # -- executor's thread --------------------------------------------------------------------------------------

@@ -158,6 +158,18 @@ def path_to_msg(poses: Sequence[StampedPose], frame_id: str, types: MessageTypes
     )
 
 
+def transform_to_msg(pose: StampedPose, frame_id: str, child_frame_id: str, types: MessageTypes) -> Any:
+    """A tf2_msgs/TFMessage with one transform: the pose of the frame `child_frame_id` in `frame_id`."""
+    as_pose = pose_to_msg(pose.T, types)
+    transform = types("geometry_msgs/msg/Transform")(
+        translation=vector_to_msg(pose.T[:3, 3], types), rotation=as_pose.orientation
+    )
+    stamped = types("geometry_msgs/msg/TransformStamped")(
+        header=header_to_msg(pose.stamp, frame_id, types), child_frame_id=str(child_frame_id), transform=transform
+    )
+    return types("tf2_msgs/msg/TFMessage")(transforms=[stamped])
+
+
 def pose_with_covariance_to_msg(pose: StampedPose, covariance: Array | None, frame_id: str, types: MessageTypes) -> Any:
     """A geometry_msgs/PoseWithCovarianceStamped; `covariance` (6, 6) of GTSAM's tangent, None: unknown."""
     return types("geometry_msgs/msg/PoseWithCovarianceStamped")(

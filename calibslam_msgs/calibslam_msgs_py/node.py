@@ -5,23 +5,41 @@ from __future__ import annotations
 import signal
 import sys
 import threading
+import time
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from copy import copy
+from typing import Any
 
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy.clock import Clock, ClockType
+from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
-from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy, qos_profile_sensor_data
+from rclpy.qos import (
+    DurabilityPolicy,
+    HistoryPolicy,
+    QoSPolicyKind,
+    QoSProfile,
+    ReliabilityPolicy,
+    qos_profile_sensor_data,
+)
+from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.signals import SignalHandlerOptions
 
+from calibslam_msgs_py.measurements import SECOND, InvalidMeasurement
 from calibslam_msgs_py.settings import SettingsError
 
 # Raw sensor input: best effort, so that it connects to every publisher.
 SENSOR: QoSProfile = qos_profile_sensor_data
-# Boxes and motions: none may get lost.
-MEASUREMENT = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=100, reliability=ReliabilityPolicy.RELIABLE)
+# Boxes and motions: none may get lost. Kept for who asks for the last ones (transient local), as after a restart.
+MEASUREMENT = QoSProfile(
+    history=HistoryPolicy.KEEP_LAST,
+    depth=100,
+    reliability=ReliabilityPolicy.RELIABLE,
+    durability=DurabilityPolicy.TRANSIENT_LOCAL,
+)
 # Who takes them in has room for several seconds of them, for a moment when it is busy.
 MEASUREMENT_INPUT = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=5000, reliability=ReliabilityPolicy.RELIABLE)
 # Maps: the last one also for who joins late.
@@ -32,7 +50,13 @@ LATCHED = QoSProfile(
     durability=DurabilityPolicy.TRANSIENT_LOCAL,
 )
 
+# Parameters `qos_overrides.TOPIC.publisher.depth` and so on.
+QOS_OVERRIDES = QoSOverridingOptions(
+    [QoSPolicyKind.HISTORY, QoSPolicyKind.DEPTH, QoSPolicyKind.RELIABILITY, QoSPolicyKind.DURABILITY]
+)
+
 BAD_SETTINGS = 2  # exit code
+SECONDS_BETWEEN_WARNINGS = 5.0
 SIGNAL_LATENCY = 0.1  # how long a waiting executor may not see a signal [s]
 
 
@@ -89,28 +113,51 @@ def refuse_unknown_parameters(node: Node) -> None:
     """
     unknown = sorted(name for name in node._parameter_overrides if not node.has_parameter(name))
     if unknown:
-        valid = sorted(name for name in node._parameters if not name.startswith("start_type_description"))
-        raise SettingsError(f"{node.get_name()}: unknown parameter {', '.join(unknown)}; valid are: {', '.join(valid)}")
+        ours = sorted(name for name in node._parameters if not name.startswith(("start_type", "qos_overrides.")))
+        raise SettingsError(
+            f"{node.get_name()}: unknown parameter {', '.join(unknown)}; valid are: {', '.join(ours)}, and those that "
+            "`ros2 param list` shows as qos_overrides"
+        )
 
 
 class Counters:
     """What happened in a node, by name, published on /diagnostics once per second of wall time.
 
-    The level is WARN while counters named `rejected...` grow, and OK otherwise.
+    The level is ERROR while counters named `errors...` grow, WARN while such as `rejected...` or `lost...` do, and OK
+    otherwise.
+
+    Args:
+        node: that publishes.
+        describe: gives further values, by name, when they are published.
     """
 
-    def __init__(self, node: Node) -> None:
-        self._node = node
+    WARN, ERROR = ("rejected", "lost"), ("errors",)
+
+    def __init__(self, node: Node, describe: Callable[[], Mapping[str, object]] | None = None) -> None:
+        self._node, self._describe = node, describe
+        self._counting = threading.Lock()  # several threads may count
         self._counts: Counter[str] = Counter()
         self._values: dict[str, str] = {}
         self._published: Counter[str] = Counter()
+        self._inputs: dict[str, _Input] = {}
         self._publisher = node.create_publisher(DiagnosticArray, "/diagnostics", 10)
         # Wall time: with use_sim_time and no /clock yet, a timer of the node's clock would never fire.
         self._timer = node.create_timer(1.0, self._publish, clock=Clock(clock_type=ClockType.STEADY_TIME))
 
     def count(self, name: str, by: int = 1) -> None:
         """Add to a counter."""
-        self._counts[name] += by
+        with self._counting:
+            self._counts[name] += by
+
+    def reject(self, error: InvalidMeasurement, count: int = 1) -> None:
+        """Count what is left out by its reason, and say so now and then."""
+        self.count(f"rejected_{error.reason}", count)
+        self._node.get_logger().warning(f"left out: {error}", throttle_duration_sec=SECONDS_BETWEEN_WARNINGS)
+
+    def arrived(self, name: str, stamp: int) -> None:
+        """A message of an input came; stamp [ns]. Its rate, age and delay are then stated."""
+        now = self._node.get_clock().now().nanoseconds
+        self._inputs.setdefault(name, _Input()).arrived(stamp, now)
 
     def set(self, name: str, value: object) -> None:
         """State a value, such as a duration with its unit."""
@@ -120,20 +167,86 @@ class Counters:
         return self._counts[name]
 
     def _publish(self) -> None:
-        growing = [
-            name
-            for name, count in sorted(self._counts.items())
-            if name.startswith("rejected") and count > self._published[name]
-        ]
-        self._published = self._counts.copy()
-        values = {name: str(count) for name, count in sorted(self._counts.items())} | self._values
+        with self._counting:
+            counts = self._counts.copy()
+        growing = [name for name, count in sorted(counts.items()) if count > self._published[name]]
+        errors = [name for name in growing if name.startswith(self.ERROR)]
+        warnings = [name for name in growing if name.startswith(self.WARN)]
+        self._published = counts
+        values = {name: str(count) for name, count in sorted(counts.items())} | self._values
+        for name, each in self._inputs.items():
+            values |= {f"{name}_{key}": value for key, value in each.values().items()}
+        if self._describe is not None:
+            values |= {name: str(value) for name, value in self._describe().items()}
+        level = DiagnosticStatus.WARN if warnings else DiagnosticStatus.OK
         status = DiagnosticStatus(
-            level=DiagnosticStatus.WARN if growing else DiagnosticStatus.OK,
+            level=DiagnosticStatus.ERROR if errors else level,
             name=self._node.get_fully_qualified_name(),
-            message=", ".join(growing) or "running",
+            message=", ".join(errors + warnings) or "running",
             hardware_id="calibslam",
             values=[KeyValue(key=key, value=value) for key, value in values.items()],
         )
         array = DiagnosticArray(status=[status])
         array.header.stamp = self._node.get_clock().now().to_msg()
         self._publisher.publish(array)
+
+
+class _Input:
+    """When the messages of a topic came."""
+
+    def __init__(self) -> None:
+        self._since = self._last = time.monotonic()
+        self._count = self._delay = 0
+
+    def arrived(self, stamp: int, now: int) -> None:
+        self._last = time.monotonic()
+        self._count += 1
+        self._delay = now - stamp
+
+    def values(self) -> dict[str, str]:
+        """Rate since the last call [Hz], time since the last message [s], and how old that was when it came [s]."""
+        now = time.monotonic()
+        rate = self._count / max(now - self._since, 1e-3)
+        self._since, self._count = now, 0
+        return {
+            "hz": f"{rate:.1f}",
+            "age_s": f"{now - self._last:.2f}",
+            "delay_s": f"{self._delay / SECOND:.3f}",
+        }
+
+
+def advertise(node: Node, kind: Any, topic: str, profile: QoSProfile) -> Any:
+    """A publisher whose quality of service can be overridden by parameters."""
+    # A copy: rclpy writes the overrides into the profile itself.
+    return node.create_publisher(kind, topic, copy(profile), qos_overriding_options=QOS_OVERRIDES)
+
+
+def subscribe(
+    node: Node,
+    counters: Counters,
+    kind: Any,
+    topic: str,
+    receive: Callable[[Any], None],
+    profile: QoSProfile,
+    raw: bool = False,
+) -> None:
+    """A subscription whose quality of service can be overridden by parameters.
+
+    What the middleware loses is counted as `lost_TOPIC`; a publisher that it cannot connect to is named in a warning.
+
+    Args:
+        receive: takes a message, or with `raw` its bytes.
+    """
+
+    def lost(info: Any) -> None:
+        counters.count(f"lost_{topic}", info.total_count_change)
+
+    node.create_subscription(
+        kind,
+        topic,
+        receive,
+        copy(profile),
+        raw=raw,
+        qos_overriding_options=QOS_OVERRIDES,
+        event_callbacks=SubscriptionEventCallbacks(message_lost=lost),
+    )

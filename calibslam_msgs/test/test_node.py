@@ -12,9 +12,12 @@ import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
+from rclpy.parameter import Parameter
+from rclpy.qos import DurabilityPolicy
 from std_msgs.msg import String
 
-from calibslam_msgs_py.node import LATCHED, MEASUREMENT, SENSOR, Counters
+from calibslam_msgs_py.measurements import SECOND, InvalidMeasurement
+from calibslam_msgs_py.node import LATCHED, MEASUREMENT, MEASUREMENT_INPUT, SENSOR, Counters, subscribe
 
 NODE = textwrap.dedent("""
     import sys
@@ -130,3 +133,35 @@ def test_profiles_connect(
         talker.publish(String(data=str(i)))
     spin_until(executor, lambda: len(received) == 5)
     assert [msg.data for msg in received] == list("01234")
+
+
+def test_inputs_and_what_the_node_adds_reach_diagnostics(nodes: tuple[Node, Node, SingleThreadedExecutor]) -> None:
+    one, other, executor = nodes
+    received: list[DiagnosticArray] = []
+    other.create_subscription(DiagnosticArray, "/diagnostics", received.append, 10)
+    counters = Counters(one, lambda: {"memory_mb": 12})
+    counters.reject(InvalidMeasurement("nan", "three boxes"), 3)
+    counters.count("errors_journal")
+    for _ in range(5):
+        counters.arrived("detections", one.get_clock().now().nanoseconds - 2 * SECOND)
+    spin_until(executor, lambda: received)
+    (status,) = received[0].status
+    values = {v.key: v.value for v in status.values}
+    assert values["memory_mb"] == "12" and values["rejected_nan"] == "3"
+    assert float(values["detections_hz"]) > 0.0 and float(values["detections_age_s"]) >= 0.0
+    assert float(values["detections_delay_s"]) == pytest.approx(2.0, abs=0.1)
+    assert (status.level, status.message) == (DiagnosticStatus.ERROR, "errors_journal, rejected_nan")
+
+
+def test_an_override_is_of_one_topic_only(nodes: tuple[Node, Node, SingleThreadedExecutor]) -> None:
+    name = "qos_overrides./kept.subscription.durability"
+    node = Node("overridden", context=nodes[0].context, parameter_overrides=[Parameter(name, value="transient_local")])
+    counters = Counters(node)
+    for topic in ("kept", "plain"):
+        subscribe(node, counters, String, topic, print, MEASUREMENT_INPUT)
+    found = {
+        topic: node.get_subscriptions_info_by_topic(f"/{topic}")[0].qos_profile.durability
+        for topic in ("kept", "plain")
+    }
+    assert found == {"kept": DurabilityPolicy.TRANSIENT_LOCAL, "plain": DurabilityPolicy.VOLATILE}
+    assert MEASUREMENT_INPUT.durability != DurabilityPolicy.TRANSIENT_LOCAL

@@ -74,7 +74,7 @@ def run_live(bag: Path, out: Path, rate: float) -> None:
             processes.start(
                 condition.name,
                 "calibslam_backend.backend_node",
-                [*namespace, *inputs, "-p", f"noise_model:={condition.noise_model}"],
+                [*namespace, *inputs, "-p", f"noise_model:={condition.noise_model}", "-p", f"map_folder:={out}"],
             )
             processes.start(
                 f"{condition.name}_recorder",

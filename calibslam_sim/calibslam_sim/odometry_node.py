@@ -25,12 +25,11 @@ from calibslam_msgs_py.conversions import (
     stamped_pose_from_msg,
 )
 from calibslam_msgs_py.measurements import InvalidMeasurement, RelativeMotion
-from calibslam_msgs_py.node import MEASUREMENT, MEASUREMENT_INPUT, Counters, run
+from calibslam_msgs_py.node import MEASUREMENT, MEASUREMENT_INPUT, Counters, advertise, run, subscribe
 from calibslam_msgs_py.settings import Settings, SettingsError, declare_parameters, setting
 from calibslam_sim.odometry_noise import OdometryNoise, add_noise
 from calibslam_sim.random_streams import stream
 
-SECONDS_BETWEEN_WARNINGS = 5.0
 CAMERA_FRAME = "camera"  # whose pose the topic `ground_truth` is
 
 
@@ -67,18 +66,19 @@ class OdometryNode(Node):
         self._differencer = OdometryDifferencer()
         self._types = RosTypes()
         self._counters = Counters(self)
-        self._publisher = self.create_publisher(RelativePose, "relative_pose", MEASUREMENT)
+        self._publisher = advertise(self, RelativePose, "relative_pose", MEASUREMENT)
         if settings.source == "odom":
-            self.create_subscription(Odometry, "odom", self._receive_odometry, MEASUREMENT_INPUT)
+            subscribe(self, self._counters, Odometry, "odom", self._receive_odometry, MEASUREMENT_INPUT)
         else:
-            self.create_subscription(PoseStamped, "ground_truth", self._receive_truth, MEASUREMENT_INPUT)
+            subscribe(self, self._counters, PoseStamped, "ground_truth", self._receive_truth, MEASUREMENT_INPUT)
 
     def _receive_odometry(self, message: Any) -> None:
         try:
             pose, velocity_covariance = odometry_from_msg(message)
+            self._counters.arrived("odom", pose.stamp)
             motion = self._differencer.add(pose.stamp, pose.T, velocity_covariance, message.child_frame_id)
         except InvalidMeasurement as error:
-            self._reject(error)
+            self._counters.reject(error)
             return
         if motion is not None:
             self._publish(motion)
@@ -86,9 +86,10 @@ class OdometryNode(Node):
     def _receive_truth(self, message: Any) -> None:
         try:
             pose = stamped_pose_from_msg(message)
+            self._counters.arrived("ground_truth", pose.stamp)
             motion = self._differencer.add(pose.stamp, pose.T, frame_id=CAMERA_FRAME)
         except InvalidMeasurement as error:
-            self._reject(error)
+            self._counters.reject(error)
             return
         if motion is not None:
             # Exact so far: the only error is the one added.
@@ -98,10 +99,6 @@ class OdometryNode(Node):
         noisy = add_noise(motion, self._noise, self._random)
         self._publisher.publish(motion_to_msg(noisy, self._types))
         self._counters.count("motions")
-
-    def _reject(self, error: InvalidMeasurement) -> None:
-        self._counters.count(f"rejected_{error.reason}")
-        self.get_logger().warning(f"pose left out: {error}", throttle_duration_sec=SECONDS_BETWEEN_WARNINGS)
 
 
 def main(args: Sequence[str] | None = None) -> int:

@@ -59,7 +59,8 @@ def block(result: dict[str, Any], experiment: Experiment) -> str:
     ]
     if "filter_graph_max_difference" in result:
         notes.append(f"Largest difference between filter and graph: {result['filter_graph_max_difference']:.1e}.")
-    notes.append(f"{result['seconds'] / 60.0:.1f} minutes of computing.")
+    code = f", code {result['code']}" if "code" in result else ""
+    notes.append(f"{result['seconds'] / 60.0:.1f} minutes of computing{code}.")
     return "\n\n".join([*parts, " ".join(notes)])
 
 

@@ -19,6 +19,7 @@ from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 from calibslam_msgs_py.conversions import RosTypes, camera_from_msg, motion_to_msg
 from calibslam_msgs_py.measurements import InvalidMeasurement
 from calibslam_msgs_py.node import MEASUREMENT, SENSOR, Counters, run
+from calibslam_msgs_py.node_sensors import SensorSubscription
 from calibslam_msgs_py.settings import declare_parameters
 from calibslam_sim.depth_camera import DepthCamera, DepthCameraSettings
 from calibslam_sim.image_pairs import Pair
@@ -43,10 +44,15 @@ class VisualOdometryNode(Node):
         self._worker = threading.Thread(target=self._work, name="visual odometry", daemon=True)
         self._worker.start()
         self.create_subscription(CameraInfo, "camera/camera_info", self._receive_camera, SENSOR)
-        for kind, suffix in ((Image, ""), (CompressedImage, "/compressed")):
-            self.create_subscription(kind, f"camera/image_raw{suffix}", self._receive_image, SENSOR)
-        for kind, suffix in ((Image, ""), (CompressedImage, "/compressedDepth")):
-            self.create_subscription(kind, f"camera/depth/image_raw{suffix}", self._receive_depth, SENSOR)
+        self._images = [
+            SensorSubscription(self, kind, topic, receive)
+            for kind, topic, receive in (
+                (Image, "camera/image_raw", self._receive_image),
+                (CompressedImage, "camera/image_raw/compressed", self._receive_image),
+                (Image, "camera/depth/image_raw", self._receive_depth),
+                (CompressedImage, "camera/depth/image_raw/compressedDepth", self._receive_depth),
+            )
+        ]
 
     # -- executor's thread --------------------------------------------------------------------------------------
 

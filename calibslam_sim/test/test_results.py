@@ -25,6 +25,7 @@ def result() -> dict[str, Any]:
             "calibrated_vs_overconfident": {"ate_m": paired(VALUES["calibrated"], VALUES["overconfident"])},
         },
         "nees_interval": {},
+        "code": "0.1.0+3f2a90c1d4e5",
         "command": "./calibslam run calibslam_sim experiment toy --out results/toy",
         "seconds": 90.0,
     }
@@ -36,7 +37,7 @@ def test_tables_show_ours_and_the_documents_numbers() -> None:
     assert lines[ours + 1] == "| *calibrated, the document* | 0.988 ± 0.36 |"
     # Differences -1 and -2: mean -1.5, t = -3 with one degree of freedom, p = 1 - 2 atan(3) / pi = 0.205.
     assert "| calibrated - overconfident | -1.5 (0.2) |" in lines
-    assert "1.5 minutes" in lines[-1]
+    assert "1.5 minutes of computing, code 0.1.0+3f2a90c1d4e5." in lines[-1]
 
 
 def test_fill_replaces_what_stands_between_the_marks() -> None:

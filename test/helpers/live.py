@@ -71,6 +71,10 @@ class Process:
         )
 
     @property
+    def pid(self) -> int:
+        return self._process.pid
+
+    @property
     def output(self) -> str:
         """What it has said so far."""
         self._output.seek(0)

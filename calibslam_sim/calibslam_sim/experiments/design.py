@@ -69,6 +69,7 @@ class Experiment:
         document: settings -> mean and deviation in the document, of condition and metric; a deviation of None: it
             states none.
         further: more entries of result.json, from the values of each metric in each condition.
+        is_shared: whether what the conditions of a repetition share takes longest, so that one process does them all.
     """
 
     title: str
@@ -84,6 +85,7 @@ class Experiment:
     degrees_of_freedom: Mapping[str, int] = field(default_factory=dict)
     document: Callable[[Any], DocumentNumbers] = lambda settings: {}
     further: Callable[[Mapping[str, Mapping[str, Sequence[float]]]], dict[str, Any]] = lambda values: {}
+    is_shared: bool = False
 
 
 def repetition_seed(seed: int, repetition: int) -> Seed:

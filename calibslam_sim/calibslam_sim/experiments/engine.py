@@ -6,6 +6,7 @@ import time
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from importlib import import_module
+from itertools import groupby
 
 from joblib import Parallel, delayed, parallel_config
 from joblib.parallel import get_active_backend
@@ -37,14 +38,28 @@ def run(
         ExperimentError: the back end is not there.
     """
     with _engine(backend, jobs):
-        calls = [delayed(one)(name, settings, condition, number) for condition, number in wanted]
+        calls = [delayed(several)(name, settings, group) for group in groups(wanted, load(name).is_shared)]
         active, n_jobs = get_active_backend()
         if active.supports_return_generator:
-            yield from Parallel(return_as="generator_unordered")(calls)
+            for done in Parallel(return_as="generator_unordered")(calls):
+                yield from done
             return
         batch = BATCH_PER_JOB * active.effective_n_jobs(n_jobs)
         for start in range(0, len(calls), batch):
-            yield from Parallel()(calls[start : start + batch])
+            for done in Parallel()(calls[start : start + batch]):
+                yield from done
+
+
+def groups(wanted: Sequence[tuple[str, int]], is_shared: bool) -> list[list[tuple[str, int]]]:
+    """What one process does in one go: the conditions of a repetition if they share much, otherwise each alone."""
+    if not is_shared:
+        return [[each] for each in wanted]
+    return [list(group) for _, group in groupby(wanted, key=lambda each: each[1])]
+
+
+def several(name: str, settings: ExperimentSettings, wanted: Sequence[tuple[str, int]]) -> list[Repetition]:
+    """Some conditions on some seeds."""
+    return [one(name, settings, condition, number) for condition, number in wanted]
 
 
 def one(name: str, settings: ExperimentSettings, condition: str, number: int) -> Repetition:

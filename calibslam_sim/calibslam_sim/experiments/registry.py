@@ -12,6 +12,7 @@ MODULES = {
     "toy": "calibslam_sim.experiments.toy",
     "quadric_sim": "calibslam_sim.experiments.quadric_sim",
     "tum": "calibslam_sim.experiments.tum",
+    "image": "calibslam_sim.experiments.image",
     "fcal": "calibslam_sim.experiments.fcal",
 }
 

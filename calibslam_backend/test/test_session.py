@@ -1,0 +1,288 @@
+"""A live session: after it was killed, another one ends where it would have ended; what cannot be used is counted."""
+
+from __future__ import annotations
+
+import pickle
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
+
+import gtsam
+import numpy as np
+import pytest
+from small_world import CAMERA, SmallWorld, around, objects
+
+from calibslam_backend.diagnostics import state
+from calibslam_backend.estimator import EstimatorSettings
+from calibslam_backend.intake import Event, Kind
+from calibslam_backend.journal import Journal, Record
+from calibslam_backend.metrics import Trajectory, ate
+from calibslam_backend.session import NotReady, Session
+from calibslam_backend.session_settings import SessionSettings
+from calibslam_msgs_py.measurements import Array, Boxes, InvalidMeasurement, RelativeMotion, StampedPose
+
+WORLD = SmallWorld(around(120), objects())
+NEVER = SessionSettings(refine_after=1e6)
+KINDS = {Boxes: Kind.BOXES, RelativeMotion: Kind.MOTION, StampedPose: Kind.START}
+
+
+def event(content: Boxes | RelativeMotion | StampedPose) -> Event:
+    return Event(KINDS[type(content)], content, pickle.dumps(content), 1.0)
+
+
+CAMERA_EVENT = Event(Kind.CAMERA, CAMERA, pickle.dumps(CAMERA))
+
+
+def decode(record: Record) -> Event:
+    if record.kind == 99:
+        raise ValueError("a record of tomorrow")
+    content = pickle.loads(record.payload) if record.payload else None
+    return Event(Kind(record.kind), content, record.payload)
+
+
+class Live(Session):
+    """A session that is used by one thread, and what it reported."""
+
+    def __init__(self, journal: Path | None = None, settings: SessionSettings = NEVER) -> None:
+        self.counts: Counter[str] = Counter()
+        self.said: list[str] = []
+        opened = Journal(journal) if journal else None
+        super().__init__(np.eye(4), settings, EstimatorSettings(), self, opened)
+        for _ in self.resume(decode):
+            pass
+
+    def count(self, name: str, by: int = 1) -> None:
+        self.counts[name] += by
+
+    def reject(self, error: InvalidMeasurement, count: int = 1) -> None:
+        self.counts[f"rejected_{error.reason}"] += count
+
+    def say(self, text: str) -> None:
+        self.said.append(text)
+
+    def use(self, measurements: Sequence[Boxes | RelativeMotion | StampedPose]) -> Live:
+        for measurement in measurements:
+            self.intake.offer(event(measurement))
+        while len(self.intake):
+            self.step(0.0)
+        return self
+
+    def trajectory(self) -> Array:
+        assert self.estimator is not None
+        return self.estimator.trajectory()
+
+    def error(self, world: SmallWorld = WORLD) -> float:
+        assert self.estimator is not None
+        return ate(Trajectory(np.array(self.estimator.stamps), self.trajectory()), world.truth())
+
+
+def live(journal: Path | None = None, settings: SessionSettings = NEVER) -> Live:
+    session = Live(journal, settings)
+    session.offer_camera(CAMERA_EVENT)
+    return session
+
+
+MEASUREMENTS = list(WORLD.measurements())
+
+
+@pytest.mark.parametrize("moments", [[60], [1, 2, 130, 131, 200]])
+def test_a_killed_session_is_gone_on_with(tmp_path: Path, moments: list[int]) -> None:
+    """The same numbers, to the last bit, as without interruption, although much is sent twice."""
+    undisturbed = live().use(MEASUREMENTS[:100])
+    undisturbed._refine()
+    undisturbed.use(MEASUREMENTS[100:])
+    done, sessions = 0, []
+    for moment in [*moments, len(MEASUREMENTS)]:
+        session = live(tmp_path / "journal")
+        sessions.append(session)
+        for begin, end in ((max(done - 30, 0), min(moment, 100)), (max(done - 30, 100), moment)):
+            if begin < end:
+                session.use(MEASUREMENTS[begin:end])
+            if moment > 100 > done and end == 100:
+                session._refine()
+        done = moment
+        assert session.intake.journal is not None
+        session.intake.journal.close()  # as the end of its process does
+    assert (session.trajectory() == undisturbed.trajectory()).all()
+    assert session.counts["keyframes"] == undisturbed.counts["keyframes"] > 15
+    assert session.counts["rejected_repeated"] > 0
+    assert not session.counts["errors"] and session.error() < 0.05
+
+
+def test_refinements_are_in_the_journal(tmp_path: Path) -> None:
+    """A rest refines, and what is in the journal says so."""
+    first = live(tmp_path / "journal", SessionSettings(refine_after=0.1)).use(MEASUREMENTS)
+    first._used -= 1.0  # a second ago
+    first.step(0.0)
+    assert first.refined
+    assert first.intake.journal is not None
+    first.intake.journal.close()
+    assert (live(tmp_path / "journal").trajectory() == first.trajectory()).all()
+
+
+def test_unreadable_records_are_counted(tmp_path: Path) -> None:
+    session = live(tmp_path / "journal").use(MEASUREMENTS[:10])
+    assert session.intake.journal is not None
+    session.intake.journal.append(Record(99, b"?"))
+    session.use(MEASUREMENTS[10:40])
+    session.intake.journal.close()
+    again = live(tmp_path / "journal")
+    assert again.counts["errors_journal"] == 1 and "a record of tomorrow" in again.said[0]
+    assert (again.trajectory() == session.trajectory()).all()
+
+
+def test_loaded_maps_and_resets_are_in_the_journal(tmp_path: Path) -> None:
+    path = tmp_path / "journal"
+    first = live(path).use(MEASUREMENTS)
+    first.save(tmp_path / "map.json")
+    assert first.estimator is not None and first.intake.journal is not None
+    known = first.estimator.object_map()
+    size = path.stat().st_size
+    first.reset()
+    assert path.stat().st_size < 0.01 * size
+    first.use(MEASUREMENTS[:20])
+    first.load(known)
+    first.intake.journal.close()
+
+    def decode_map(record: Record) -> Event:
+        if record.kind == Kind.MAP:
+            return Event(Kind.MAP, type(known).from_json(record.payload.decode(), "journal"), record.payload)
+        return decode(record)
+
+    journal = Journal(path)
+    again = Session(np.eye(4), NEVER, EstimatorSettings(), first, journal)
+    for _ in again.resume(decode_map):
+        pass
+    assert again.estimator is not None
+    assert (again.estimator.objects, again.estimator.stamps) == (len(known.quadrics), [])
+    assert state(again) == "looking for the camera in the map"
+
+
+def test_nothing_is_done_while_the_journal_is_read(tmp_path: Path) -> None:
+    first = live(tmp_path / "journal").use(MEASUREMENTS[:10])
+    assert first.intake.journal is not None
+    first.intake.journal.close()
+    second = Session(np.eye(4), NEVER, EstimatorSettings(), first, Journal(tmp_path / "journal"))
+    steps = second.resume(decode)
+    next(steps)
+    assert state(second).startswith("reading the journal")
+    for call in (second.reset, lambda: second.save(tmp_path / "map.json")):
+        with pytest.raises(NotReady, match="still being read"):
+            call()
+
+
+def test_a_start_pose_is_where_the_trajectory_begins(tmp_path: Path) -> None:
+    """Half a metre and 10 degrees wrong; boxes then say it better."""
+    world = replace(WORLD, seed=3)
+    first = live().use(MEASUREMENTS)
+    assert first.estimator is not None
+    known = first.estimator.object_map()
+    later = live()
+    later.load(known)
+    true = first.trajectory()[0] @ np.linalg.inv(WORLD.poses[0]) @ world.poses[30]
+    wrong = gtsam.Pose3(true).retract(np.array([0.1, 0.1, 0.1, 0.3, 0.3, 0.2])).matrix()
+    content = [m for m in world.measurements() if (m.stamp if isinstance(m, Boxes) else m.start) >= world.stamps[30]]
+    later.use([StampedPose(0, wrong), *content])
+    assert later.estimator is not None and later.estimator.stamps[0] == world.stamps[30]
+    ends = [later.trajectory()[-1], first.trajectory()[-1]]
+    assert np.linalg.norm(ends[0][:3, 3] - ends[1][:3, 3]) < 0.1
+
+
+def test_a_start_pose_without_a_map_is_rejected() -> None:
+    session = live().use([StampedPose(0, np.eye(4))])
+    assert session.counts["rejected_start_pose"] == 1
+
+
+def test_a_start_pose_during_a_trajectory_begins_a_new_one_in_the_same_map() -> None:
+    session = live().use(MEASUREMENTS)
+    assert session.estimator is not None
+    number, last = session.estimator.objects, session.trajectory()[-1]
+    session.use([StampedPose(0, last)])
+    assert (session.estimator.objects, session.estimator.stamps) == (number, [])
+    assert session.counts["images"] == 120
+    back = [replace(m, stamp=t + 10**10) for m, t in zip(WORLD.boxes()[::-1], WORLD.stamps, strict=True)]
+    ways = [
+        RelativeMotion(a.stamp, b.stamp, np.linalg.inv(WORLD.poses[119 - k]) @ WORLD.poses[118 - k], np.eye(6) * 1e-6)
+        for k, (a, b) in enumerate(pairwise(back))
+    ]
+    session.use([m for pair in zip(back, ways, strict=False) for m in pair])
+    assert session.estimator.stamps[0] == back[0].stamp and len(session.estimator.stamps) > 15
+    assert session.counts["images"] == 120 + 119
+    first = WORLD.poses[119] @ np.linalg.inv(last) @ session.trajectory()
+    assert np.linalg.norm(first[0, :3, 3] - WORLD.poses[119][:3, 3]) < 0.1
+
+
+@pytest.mark.parametrize(("time_jump", "objects_kept"), [("reset", False), ("keep_map", True)])
+def test_a_looping_bag(time_jump: str, objects_kept: bool) -> None:
+    session = live(settings=SessionSettings(refine_after=1e6, time_jump=time_jump)).use(MEASUREMENTS)
+    assert session.estimator is not None
+    before = session.estimator.objects
+    session.use(MEASUREMENTS[:12])
+    assert session.counts["time_jumps"] == 1
+    assert session.estimator.objects == (before if objects_kept else 0)
+    session.use(MEASUREMENTS[12:])
+    # The first image of all came before the motions that tell of the jump.
+    assert (session.counts["images"], session.counts["rejected_late"]) == (239, 1)
+    assert session.error() < 0.05 and not session.counts["errors"]
+
+
+def test_images_without_odometry_are_bounded() -> None:
+    session = live(settings=SessionSettings(images_without_odometry=50))
+    session.use(WORLD.boxes())
+    assert session.estimator is not None and session.estimator.waiting == 50
+    assert session.counts["rejected_no_odometry"] == 70
+    session.use(WORLD.motions())
+    assert session.estimator.waiting == 0 and len(session.estimator.stamps) > 5
+
+
+def test_a_full_queue_drops_images_before_motions() -> None:
+    session = live(settings=SessionSettings(queue_size=10))
+    for boxes in WORLD.boxes()[:10]:
+        session.intake.offer(event(boxes))
+    with pytest.raises(InvalidMeasurement, match="faster than they can be used"):
+        session.intake.offer(event(WORLD.boxes()[11]))
+    for k in range(10):
+        session.intake.offer(event(WORLD.motions()[k]))
+    with pytest.raises(InvalidMeasurement, match="faster than they can be used"):
+        session.intake.offer(event(WORLD.motions()[10]))
+
+
+@pytest.mark.parametrize("share", [7, 1 / 7])
+def test_odometry_slower_or_faster_than_detections(share: float) -> None:
+    """Every image gets its pose: one motion for seven images, and seven motions for one image."""
+    boxes, motions = WORLD.boxes(), WORLD.motions()
+    if share > 1:
+        joined = []
+        for k in range(0, 119 - 6, 7):
+            T = np.linalg.multi_dot([m.T_start_end for m in motions[k : k + 7]])
+            covariance = np.sum([m.covariance for m in motions[k : k + 7]], axis=0)
+            joined.append(RelativeMotion(motions[k].start, motions[k + 6].end, T, covariance))
+        motions = joined
+    else:
+        boxes = boxes[::7]
+    content = sorted([*boxes, *motions], key=lambda m: m.stamp if isinstance(m, Boxes) else m.end)
+    session = live().use(content)
+    assert session.estimator is not None
+    assert session.estimator.waiting <= 7 and session.counts["images"] == len(boxes)
+    assert not any(name.startswith("rejected") for name in session.counts) and session.error() < 0.06
+
+
+def test_boxes_of_another_camera_are_rejected() -> None:
+    session = live()
+    other = [
+        replace(m, frame_id="rear") if isinstance(m, Boxes) and i % 4 == 0 else m for i, m in enumerate(MEASUREMENTS)
+    ]
+    session.use(other)
+    assert session.counts["rejected_frame"] == sum(m.frame_id == "rear" for m in other) > 20
+    assert session.error() < 0.05
+
+
+def test_innovations_of_a_true_world_are_what_they_should_be() -> None:
+    """A quarter of chi-squared with 4 degrees of freedom has a mean of 1; a factor of two is seen with few boxes."""
+    nis: list[float] = []
+    for seed in range(4):
+        session = live().use(list(replace(WORLD, seed=seed).measurements()))
+        nis += session.tally.nis
+    assert len(nis) > 40 and 0.5 < np.mean(nis) < 2.0

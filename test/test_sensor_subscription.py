@@ -1,0 +1,44 @@
+"""Subscriptions of images: they connect to publishers of either kind, and large images of reliable ones all arrive."""
+
+from __future__ import annotations
+
+import time
+
+import pytest
+from live import Watcher, random_domain, wait_until
+from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
+from sensor_msgs.msg import Image
+
+from calibslam_msgs_py.message_types import RosTypes
+from calibslam_msgs_py.node_sensors import SensorSubscription
+
+IMAGES = 20
+
+
+@pytest.mark.parametrize("reliability", [ReliabilityPolicy.RELIABLE, ReliabilityPolicy.BEST_EFFORT])
+def test_as_reliable_as_the_publisher(reliability: ReliabilityPolicy) -> None:
+    domain = random_domain()
+    received: list[int] = []
+    with Watcher(domain) as subscriber, Watcher(domain) as publishing:
+        subscription = SensorSubscription(
+            subscriber.node, Image, "images", lambda m: received.append(m.header.stamp.sec)
+        )
+        profile = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=100, reliability=reliability)
+        publisher = publishing.node.create_publisher(Image, "images", profile)
+
+        def matched() -> bool:
+            (info,) = subscriber.node.get_subscriptions_info_by_topic("/images") or [None]
+            return info is not None and info.qos_profile.reliability == reliability
+
+        wait_until(lambda: matched() and publisher.get_subscription_count() == 1, "they do not connect")
+        time.sleep(1.0)  # that one side has found the other does not tell that the other has
+        message = Image(height=480, width=640, encoding="rgb8", step=1920, data=RosTypes().octets(bytes(480 * 1920)))
+        for k in range(IMAGES):
+            message.header.stamp.sec = k
+            publisher.publish(message)
+            time.sleep(0.05)
+        if reliability == ReliabilityPolicy.RELIABLE:
+            wait_until(lambda: len(received) == IMAGES, lambda: f"{received}")
+        else:
+            assert received == sorted(set(received))  # some, in order
+        assert matched() and subscription is not None
