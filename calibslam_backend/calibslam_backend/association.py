@@ -27,6 +27,7 @@ from calibslam_msgs_py.settings import Settings, setting
 
 GIVEN, ESTIMATED = "given", "estimated"
 SIZE_RATIO = 3.0  # mean radii of one object, estimated twice, differ by less than this factor
+ONE_PLACE = 0.5  # distance of two centres, in mean radii of the smaller, within which there is room for one object only
 
 
 @dataclass(frozen=True)
@@ -34,7 +35,7 @@ class AssociationSettings(Settings):
     association: str = setting(
         ESTIMATED, "identities of boxes: estimated, or given by their object_id", choices=(ESTIMATED, GIVEN)
     )
-    gate: float = setting(0.99, "probability that a box of the landmark passes the gate", low=0.5, high=0.9999)
+    gate: float = setting(0.999, "probability that a box of the landmark passes the gate", low=0.5, high=0.9999)
     min_overlap: float = setting(0.2, "intersection over union of predicted and measured box", low=0.0, high=1.0)
     votes: int = setting(3, "keyframes that must agree before a track is bound to a landmark", low=1)
     model_error: float = setting(
@@ -44,7 +45,7 @@ class AssociationSettings(Settings):
         3.0, "log of the odds over the second best quadric below which a decision waits", low=0.0, high=100.0
     )
     revised: int = setting(20, "earlier keyframes, with each new one, whose boxes are judged anew", low=0)
-    wrong_class: float = setting(0.05, "share of boxes that carry a wrong class", low=1e-6, high=0.5)
+    wrong_class: float = setting(0.02, "share of boxes that carry a wrong class", low=1e-6, high=0.5)
     merge_distance: float = setting(
         0.7,
         "distance of two centres below which they are one object, as a share of the sum of their radii",
@@ -187,3 +188,12 @@ def same_object(vector: Array, others: Array, merge_distance: float) -> NDArray[
     size, sizes = mean_radius(vector), mean_radius(others)
     alike = np.maximum(size, sizes) < SIZE_RATIO * np.minimum(size, sizes)
     return np.asarray(alike & (distances < merge_distance * (size + sizes)))
+
+
+def at_one_place(vector: Array, others: Array) -> NDArray[np.bool_]:
+    """Which of M quadrics (M, 9) have their centres so near to that of one (9,) that they cannot be two things.
+
+    Two objects of a class do not stand in each other: a detector that draws two boxes there has seen one twice.
+    """
+    distances = np.linalg.norm(others[:, :3] - vector[:3], axis=1)
+    return np.asarray(distances < ONE_PLACE * np.minimum(mean_radius(vector), mean_radius(others)))

@@ -18,6 +18,7 @@ from calibslam_backend.association import (
     Prediction,
     Votes,
     assign,
+    at_one_place,
     distances,
     predict,
     predicted_corners,
@@ -32,7 +33,7 @@ from calibslam_backend.innovation import innovations
 from calibslam_backend.localisation import localise
 from calibslam_backend.noise import NoiseModel, spread
 from calibslam_backend.relocalisation import Relocalised, relocalise
-from calibslam_backend.revision import revise
+from calibslam_backend.revision import Revision
 from calibslam_backend.tracking import overlap
 from calibslam_msgs_py.measurements import Array, Boxes, Camera
 
@@ -302,12 +303,20 @@ class DataAssociation:
         """
         if self.settings.association == GIVEN:
             return 0
-        ids = [j for j in self._graph.landmarks if self._graph.is_solved(j)]
+        ids = list(self._graph.landmarks)
         if not ids:
             return 0
-        quadrics = np.stack([self._graph.quadric(j) for j in ids])
+        revision = Revision(
+            np.stack([self._graph.quadric(j) for j in ids]),
+            ids,
+            [self.classes[j] for j in ids],
+            self.camera.K,
+            (self.camera.width, self.camera.height),
+            self.settings,
+        )
         turn = range(len(self.frames)) if number is None else self._next_settled(number)
-        changed = sum(self._revise_frame(k, ids, quadrics) for k in turn)
+        given: dict[int, Counter[int]] = {}
+        changed = sum(self._revise_frame(k, revision, given) for k in turn)
         for j in [j for j in ids if j not in self._known and len(self._graph.landmarks[j].boxes) < self.LEAST_BOXES]:
             self._graph.remove_quadric(j)
             self._forget(j)
@@ -323,26 +332,16 @@ class DataAssociation:
             self._revised = (turn[-1] + 1) % settled
         return turn
 
-    def _revise_frame(self, k: int, ids: list[int], quadrics: Array) -> int:
+    def _revise_frame(self, k: int, revision: Revision, given: dict[int, Counter[int]]) -> int:
+        """Returns how many boxes changed hands; `given` keeps `_given_to` of tracks while none does."""
         frame = self.frames[k]
         if not frame.boxes:
             return 0
-        by_track = [
-            Counter(j for i, m in self._candidates[t].seen if (j := self.frames[i].quadrics[m]) is not None)
-            for t in frame.tracks
-        ]
-        revised = revise(
-            self._graph.pose(k),
-            frame.arrays,
-            frame.classes,
-            by_track,
-            quadrics,
-            ids,
-            [self.classes[j] for j in ids],
-            self.camera.K,
-            (self.camera.width, self.camera.height),
-            self.settings,
-        )
+        for track in frame.tracks:
+            if track not in given:
+                given[track] = self._given_to(self._candidates[track])
+        by_track = [given[track] for track in frame.tracks]
+        revised = revision.judge(self._graph.pose(k), frame.arrays, frame.classes, by_track)
         changed = [n for n, (old, new) in enumerate(zip(frame.quadrics, revised, strict=True)) if old != new]
         for n in changed:
             self._take(k, n)
@@ -351,12 +350,14 @@ class DataAssociation:
                 self._give(k, n, j)
         for n in changed:
             self._rebind(frame.tracks[n])
+        if changed:
+            given.clear()
         return len(changed)
 
     def _rebind(self, track: int) -> None:
         """A track belongs to the quadric that most of its boxes are given to."""
         candidate = self._candidates[track]
-        given = Counter(j for k, n in candidate.seen if (j := self.frames[k].quadrics[n]) is not None)
+        given = self._given_to(candidate)
         if given:
             j, number = given.most_common(1)[0]
             if number >= self.settings.votes and 2 * number > len(candidate.seen):
@@ -377,15 +378,21 @@ class DataAssociation:
             return gone
         vectors = np.stack([self._graph.quadric(j) for j in ids])
         for m in reversed(range(len(ids))):
-            # An older quadric of its place, size and class, never seen beside it, is the same object.
-            for n in np.flatnonzero(same_object(vectors[m], vectors[:m], self.settings.merge_distance)):
+            # An older quadric of its place, size and class, never seen beside it, is the same object; even one that was
+            # seen beside it, if both have settled at one place.
+            inside = at_one_place(vectors[m], vectors[:m]) & self._is_settled(ids[m])
+            for n in np.flatnonzero(same_object(vectors[m], vectors[:m], self.settings.merge_distance) | inside):
                 j, older = ids[m], ids[n]
                 boxes, others = (self._graph.landmarks[i].boxes.keys() for i in (j, older))
-                if self.class_of_quadric(older) == self.class_of_quadric(j) and not _apart(boxes, others):
+                alike = self.class_of_quadric(older) == self.class_of_quadric(j)
+                if alike and (inside[n] or not _apart(boxes, others)):
                     self._unite(j, older)
                     gone.append(j)
                     break
         return gone
+
+    def _is_settled(self, j: int) -> bool:
+        return len(self.frames) - self._graph.landmarks[j].born > self.YOUNG
 
     def spread_over_all(self) -> None:
         """Covariances of boxes from the spread of all boxes of their quadric, not of those so far (eq. 4.3.1)."""
@@ -454,6 +461,10 @@ class DataAssociation:
         self._graph.remove_quadric(j)
         del self.classes[j]
         self.counts["merged"] += 1
+
+    def _given_to(self, candidate: Candidate) -> Counter[int]:
+        """How many boxes of a track are given to which quadrics."""
+        return Counter(j for k, n in candidate.seen if (j := self.frames[k].quadrics[n]) is not None)
 
     def _open_rows(self, candidate: Candidate) -> list[tuple[int, int]]:
         """Boxes of a track, (keyframe, row), that are given to no quadric."""

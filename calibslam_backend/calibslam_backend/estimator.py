@@ -15,6 +15,7 @@ from __future__ import annotations
 import time
 from bisect import insort
 from collections import Counter
+from collections.abc import Callable, Set
 from dataclasses import dataclass
 
 import gtsam
@@ -24,7 +25,7 @@ from calibslam_backend.association import GIVEN
 from calibslam_backend.box_measurement import undistorted
 from calibslam_backend.data_association import DataAssociation
 from calibslam_backend.estimator_settings import EstimatorSettings
-from calibslam_backend.graph import Motion, ObjectGraph
+from calibslam_backend.graph import Motion, ObjectGraph, UpdateReport
 from calibslam_backend.kernels import load_kernels
 from calibslam_backend.noise import QUADRICSLAM
 from calibslam_backend.object_map import ObjectMap
@@ -52,9 +53,10 @@ class Keyframe:
         stamp: of its image [ns].
         T_map_camera: (4, 4) as known right after it.
         boxes: boxes that were given to quadrics.
-        added, removed: ids of quadrics.
-        repaired: what had to be repaired; "" if nothing.
+        added, removed: ids of quadrics, since the keyframe before.
+        repaired: what had to be repaired since the keyframe before; "" if nothing.
         seconds: that it took.
+        between: the longest [s] that an image since the keyframe before took, which is none itself.
         nis: normalised innovations squared of its boxes, see `innovation`; empty for most keyframes.
     """
 
@@ -66,6 +68,7 @@ class Keyframe:
     removed: list[int]
     repaired: str
     seconds: float
+    between: float
     nis: Array
 
 
@@ -75,8 +78,9 @@ class Estimator:
     SIGHTINGS_APART = SECOND // 5
     SIGHTINGS_AGREE = 0.2  # [rad, m]
     START_ERROR = 1.0  # [rad, m] of a start pose that is given
-    ROUNDS = 5  # of association and optimisation at the end
     NIS_EVERY = 10  # keyframes, since it takes about as long as half an update's votes
+    # At the end: rounds of association and optimisation, and when poses [rad, m] count as settled.
+    ROUNDS, ITERATIONS_OF_A_ROUND, ITERATIONS, CONVERGED = 5, 2, 10, 1e-3
 
     def __init__(self, camera: Camera, T_body_camera: Array, settings: EstimatorSettings) -> None:
         load_kernels()
@@ -93,6 +97,10 @@ class Estimator:
         self._tracker = Tracker(self.settings, self.camera.K)
         self._graph = ObjectGraph(self.camera.K, self.settings, self.settings, self.settings)
         self._objects = DataAssociation(self._graph, self.camera, self.settings, self.counts)
+        self._known: Set[int] = set()  # quadrics after the last keyframe
+        self._repairs: list[str] = []
+        self._between = 0.0
+        self._chores: list[Callable[[], object]] = []
         self._searching = False
         self._sighting: tuple[int, Array] | None = None  # where a camera that searches was seen last
         self._start: Array | None = None  # where it is said to be
@@ -152,24 +160,24 @@ class Estimator:
         del self._waiting[limit:]
         return dropped
 
-    def finish(self, iterations: int = 10) -> None:
-        """Relinearise until nothing moves any more: the best estimate of all that was seen."""
+    def finish(self) -> None:
+        """Associate and relinearise until nothing changes any more: the best estimate of all that was seen."""
         if not self.stamps:
             return
         for _ in range(self.ROUNDS):
             changed = self._objects.revise()
             self._objects.start_leftovers()
-            self._converge(iterations)
+            self._converge(self.ITERATIONS_OF_A_ROUND)
             self._objects.merge()
             if not changed:
                 break
-        self._converge(iterations)
+        self._converge(self.ITERATIONS)
 
     def _converge(self, iterations: int) -> None:
         for _ in range(iterations):
             before = self._graph.poses()
-            self._objects.note(self._graph.update(everything=True))
-            if np.abs(self._graph.poses() - before).max() < 1e-4:
+            self._note(self._graph.iterate())
+            if np.abs(self._graph.poses() - before).max() < self.CONVERGED:
                 break
 
     # -- estimate out -------------------------------------------------------------------------------------------
@@ -318,6 +326,9 @@ class Estimator:
                 *self._motions.between(*interval), self._motions.drifts(*interval), self._motions.measured(*interval)
             )
             if not self._moved(motion.T, boxes.stamp - self.stamps[-1]):
+                if self._chores:
+                    self._chores.pop(0)()
+                self._between = max(self._between, time.perf_counter() - began)
                 return None
         return self._keyframe(boxes, tracks, motion, found, began)
 
@@ -367,6 +378,30 @@ class Estimator:
         self._searching = False
         return found
 
+    def _chores_of(self, k: int) -> list[Callable[[], object]]:
+        """What keyframe k leaves to be done: each a piece of work for one image."""
+        objects = self._objects
+
+        def look_for_known_and_new() -> None:
+            if k:
+                objects.relocalise(k)
+            objects.start_quadrics(objects.frames[k].tracks)
+
+        def revise() -> None:
+            objects.revise(-(-self.settings.revised // 2))
+
+        return [look_for_known_and_new, revise, revise, self._settle]
+
+    def _settle(self) -> None:
+        report = self._graph.settle()
+        if report is not None:
+            self._note(report)
+
+    def _note(self, report: UpdateReport) -> None:
+        self._objects.note(report)
+        if report.repaired:
+            self._repairs.append(report.repaired)
+
     def _near_start(self, boxes: Boxes, tracks: list[int], start: Array) -> Relocalised:
         """Where the camera is found near the pose (4, 4) that it is said to have, or that pose."""
         found = self._objects.find(self._objects.frame(boxes, tracks))
@@ -379,6 +414,9 @@ class Estimator:
     def _keyframe(
         self, boxes: Boxes, tracks: list[int], motion: Motion | None, found: Relocalised | None, began: float
     ) -> Keyframe:
+        for chore in self._chores:
+            chore()
+        before = self._known
         objects = self._objects
         frame = objects.frame(boxes, tracks)
         k = len(self.stamps)
@@ -398,20 +436,21 @@ class Estimator:
             objects.bind_found(frame, found)
         if motion is not None:
             objects.vote(k, motion.covariance)
-            objects.relocalise(k)
-        added = objects.start_quadrics(tracks)
-        report = self._graph.update()
-        self._objects.note(report)
-        removed = report.removed + objects.merge()
-        objects.revise(self.settings.revised)
+        self._note(self._graph.update())
+        objects.merge()
+        self._chores = self._chores_of(k)
+        self._known = set(self._graph.landmarks)
+        repaired, self._repairs = "; ".join(self._repairs), []
+        between, self._between = self._between, 0.0
         return Keyframe(
             k,
             boxes.stamp,
             self._graph.pose(k),
             used,
-            added,
-            removed,
-            report.repaired,
+            sorted(self._known - before),
+            sorted(before - self._known),
+            repaired,
             time.perf_counter() - began,
+            between,
             nis,
         )

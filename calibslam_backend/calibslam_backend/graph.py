@@ -9,8 +9,9 @@ the tree anew without the quadric at fault, and both are reported.
 
 from __future__ import annotations
 
+import functools
 import logging
-from collections.abc import Iterator
+from collections.abc import Callable, Hashable
 from dataclasses import dataclass, field
 
 import gtsam
@@ -42,9 +43,8 @@ class GraphSettings(Settings):
     robust_scale: float = setting(2.0, "Mahalanobis distance beyond which a box is doubted", low=0.1, high=1e6)
     robust_odometry: float = setting(3.5, "Mahalanobis distance beyond which a motion is doubted", low=0.1, high=1e6)
     prior_sigma: float = setting(0.001, "first pose: it is the map's origin", unit="rad and m", low=1e-6)
-    relinearised_poses: int = setting(30, "earlier poses, with each new one, that may be relinearised", low=1)
-    relinearised_quadrics: int = setting(1, "settled quadrics, with each new pose, that may be relinearised", low=1)
-    relinearise_pose: float = setting(0.01, "change of a pose that asks for one", unit="rad and m", low=0.0)
+    relinearised: int = setting(30, "earlier keyframes, with each new one, that may be relinearised", low=1)
+    relinearise_pose: float = setting(0.02, "change of a pose that asks for one", unit="rad and m", low=0.0)
     relinearise_quadric: float = setting(0.03, "change of a quadric that asks for one", unit="m and log m", low=0.0)
     young: int = setting(20, "keyframes during which a quadric is relinearised at once", low=0)
 
@@ -68,12 +68,19 @@ class Motion:
 
 @dataclass
 class Landmark:
-    """What the graph knows of a quadric: the keyframe it was born in, the covariance (9, 9) of its prior, and its boxes
-    by keyframe."""
+    """What the graph knows of a quadric.
+
+    Attributes:
+        born: keyframe.
+        prior: (9, 9) covariance.
+        boxes: by keyframe.
+        linearised: for each box the vector (9,) of the quadric at which it was linearised last.
+    """
 
     born: int
     prior: Array
     boxes: dict[int, BoxMeasurement] = field(default_factory=dict)
+    linearised: dict[int, Array] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -92,6 +99,7 @@ class ObjectGraph:
     LARGEST_STEP = 0.5  # [rad, m] of a pose in one update; more is checked by a damped optimisation
     REPAIR_ITERATIONS = 15
     NEW_POSES = 5  # that are relinearised at once
+    FAR = 0.05  # [rad, m] that a pose may be from the base of its coordinates
     FOUND_SIGMA = 0.5  # [rad, m] of a pose found in a known map: its boxes say it better
 
     def __init__(self, K: Array, settings: GraphSettings, priors: InitialisationSettings, noise: MotionNoise) -> None:
@@ -104,10 +112,9 @@ class ObjectGraph:
         self._motions: list[Motion] = []
         self.landmarks: dict[int, Landmark] = {}
         self._origin, self._origin_sigma = T_MAP_FIRST_CAMERA, settings.prior_sigma
-        # The factors are linear in the drift: there is nothing to relinearise.
-        pose, quadric = settings.relinearise_pose, settings.relinearise_quadric
-        self._smoother = Smoother({"x": (6, pose), "q": (9, quadric), "d": (DRIFT, np.inf)})
-        self._updates = 0
+        self._smoother = Smoother({"x": (6, self.FAR), "q": (9, np.inf), "d": (DRIFT, np.inf)})
+        self._linearised: list[Array] = []  # (4, 4) of each pose where its factors were linearised
+        self._next_turn = 0
 
     # -- what is in it ------------------------------------------------------------------------------------------
 
@@ -177,6 +184,7 @@ class ObjectGraph:
         origin = gtsam.Pose3(self._origin)
         noise = gtsam.noiseModel.Isotropic.Sigma(6, self._origin_sigma)
         self._smoother.insert(_x(0), origin)
+        self._linearised.append(self._origin)
         self._smoother.add("origin", gtsam.PriorFactorPose3(_x(0), origin, noise))
 
     def add_pose(self, motion: Motion, guess: Array) -> int:
@@ -192,6 +200,7 @@ class ObjectGraph:
             self._smoother.insert(_D, np.zeros(DRIFT))
             self._smoother.add("drift", gtsam.PriorFactorVector(_D, np.zeros(DRIFT), noise))
         self._smoother.insert(_x(k), gtsam.Pose3(guess))
+        self._linearised.append(guess)
         factor = motion_factor(
             _x(k - 1), _x(k), _D, motion.T, motion.covariance, motion.drifts, self._settings.robust_odometry
         )
@@ -214,10 +223,12 @@ class ObjectGraph:
         factor = box_factor(_x(k), _q(j), box, self._K, self._settings.robust_scale)
         self._smoother.add(("box", k, j), factor)
         self.landmarks[j].boxes[k] = box
+        self.landmarks[j].linearised[k] = self.quadric(j)
 
     def remove_box(self, k: int, j: int) -> None:
         """The box of quadric j in keyframe k is of something else."""
         del self.landmarks[j].boxes[k]
+        del self.landmarks[j].linearised[k]
         self._smoother.remove(("box", k, j))
 
     def remove_quadric(self, j: int) -> None:
@@ -229,13 +240,27 @@ class ObjectGraph:
 
     # -- solving ------------------------------------------------------------------------------------------------
 
-    def update(self, everything: bool = False) -> UpdateReport:
-        """One step of ISAM2; `everything` relinearises whatever has moved."""
-        self._updates += 1
+    def update(self, turn: range = range(0)) -> UpdateReport:
+        """One step of ISAM2 with what is new; the keyframes of `turn` may be relinearised with it."""
+        self._relinearise(range(max(self.size - self.NEW_POSES, 0), self.size))
+        held = [_x(k) for k in range(self.size - self.NEW_POSES) if k not in turn]
+        return self._step(lambda: self._smoother.update(self._last(), held))
+
+    def settle(self) -> UpdateReport | None:
+        """Relinearise those of the earlier keyframes whose turn it is; None if nothing has moved there."""
+        turn = self._turn()
+        return self.update(turn) if self._relinearise(turn) else None
+
+    def iterate(self) -> UpdateReport:
+        """One step of Gauss-Newton with everything linearised anew."""
+        return self._step(lambda: self._rebuild(self._smoother.values))
+
+    def _step(self, solve: Callable[[], None]) -> UpdateReport:
+        """Solve; what goes wrong is repaired and reported."""
         before = gtsam.Values(self._smoother.values)
         reason = ""
         try:
-            self._smoother.update(self._last(), () if everything else self._held())
+            solve()
             if self._jumped(before):
                 reason = "the trajectory jumped"
         except RuntimeError as error:
@@ -243,7 +268,7 @@ class ObjectGraph:
         if reason:
             log.warning("%s; optimising the whole graph from the estimate before", reason)
             self._repair(before)
-        removed = [j for j in self.landmarks if not self._sane(j)]
+        removed = self._ran_away()
         for j in removed:
             log.warning("quadric %d ran away and is taken out", j)
             self.remove_quadric(j)
@@ -251,38 +276,69 @@ class ObjectGraph:
 
     def optimise(self) -> None:
         """The batch optimum by Levenberg-Marquardt, from which the tree is built anew."""
-        self._smoother.rebuild(self._smoother.optimise(self._smoother.values), self._last())
+        self._rebuild(self._smoother.optimise(self._smoother.values))
+
+    def _rebuild(self, values: gtsam.Values) -> None:
+        """The tree anew, all of it linearised at these values."""
+        self._smoother.rebuild(values, self._last())
+        self._linearised = list(_poses(values))
+        for j, landmark in self.landmarks.items():
+            landmark.linearised = dict.fromkeys(landmark.boxes, values.atVector(_q(j)))
 
     def _last(self) -> list[int]:
         """Quadrics, the drift and the newest pose are eliminated last: the next update will touch them again."""
         drift = [_D] if self._drifts else []
         return [*map(_q, self.landmarks), _x(self.size - 1), *drift]
 
-    def _held(self) -> Iterator[int]:
-        """What keeps its linearisation point for now, so that the work of an update is bounded.
+    def _turn(self) -> range:
+        """The earlier keyframes that are looked at now."""
+        start = self._next_turn if self._next_turn < self.size - self.NEW_POSES else 0
+        self._next_turn = start + self._settings.relinearised
+        return range(start, min(self._next_turn, self.size - self.NEW_POSES))
 
-        The newest poses and young quadrics never do. Of the others a few consecutive poses and a quadric or so may be
-        relinearised with each update, in turn.
+    def _relinearise(self, turn: range) -> int:
+        """Linearise anew the factors of these keyframes, and the boxes of young quadrics, whose variables have moved.
+
+        Returns how many.
         """
         s = self._settings
-        poses = range(self.size - self.NEW_POSES)
-        quadrics = [j for j, landmark in self.landmarks.items() if self.size - landmark.born > s.young]
-        for ids, number, key in ((poses, s.relinearised_poses, _x), (quadrics, s.relinearised_quadrics, _q)):
-            turns = -(-len(ids) // number)
-            for i, each in enumerate(ids):
-                if i // number != self._updates % turns:
-                    yield key(each)
+        poses = _poses(self._smoother.values)
+        moved = np.abs(poses - self._linearised).max(axis=(1, 2)) > s.relinearise_pose
+        names: dict[Hashable, None] = {}  # each once, in a fixed order
+        for k in turn:
+            if moved[k]:
+                names["motion", k] = names["motion", k + 1] = None
+        for j, landmark in self.landmarks.items():
+            vector = self.quadric(j)
+            young = self.size - landmark.born <= s.young
+            for k in landmark.boxes if young else [k for k in turn if k in landmark.boxes]:
+                if moved[k] or np.abs(vector - landmark.linearised[k]).max() > s.relinearise_quadric:
+                    landmark.linearised[k] = vector
+                    names["box", k, j] = None
+        for k in turn:
+            if moved[k]:
+                self._linearised[k] = poses[k]
+        for name in names:
+            self._smoother.renew(name)
+        return len(names)
 
-    def _sane(self, j: int) -> bool:
-        vector = self.quadric(j)
-        if not np.isfinite(vector).all():
-            return False
-        radii = np.exp(np.linalg.eigvalsh(matrix_from_vector(vector[3:])))
-        return bool(
-            radii.min() > self.SMALLEST_RADIUS
-            and radii.max() < self.LARGEST_RADIUS
-            and np.linalg.norm(vector[:3] - self.pose(self.size - 1)[:3, 3]) < self.LARGEST_DISTANCE
+    def _ran_away(self) -> list[int]:
+        """Quadrics that are no objects any more."""
+        ids = list(self.landmarks)
+        if not ids:
+            return []
+        vectors = np.stack([self.quadric(j) for j in ids])
+        finite = np.isfinite(vectors).all(axis=1)
+        vectors[~finite] = 0.0
+        radii = np.exp(np.linalg.eigvalsh(matrix_from_vector(vectors[:, 3:])))
+        away = np.linalg.norm(vectors[:, :3] - self.pose(self.size - 1)[:3, 3], axis=1)
+        sane = (
+            finite
+            & (radii.min(axis=1) > self.SMALLEST_RADIUS)
+            & (radii.max(axis=1) < self.LARGEST_RADIUS)
+            & (away < self.LARGEST_DISTANCE)
         )
+        return [j for j, fine in zip(ids, sane, strict=True) if not fine]
 
     def _jumped(self, before: gtsam.Values) -> bool:
         """Whether a pose moved farther than an undamped step can be trusted with."""
@@ -300,7 +356,7 @@ class ObjectGraph:
         while True:
             try:
                 values = self._smoother.optimise(before, self.REPAIR_ITERATIONS)
-                self._smoother.rebuild(values, self._last())
+                self._rebuild(values)
                 return
             except RuntimeError as error:
                 if not self.landmarks:
@@ -320,10 +376,12 @@ def _poses(values: gtsam.Values) -> Array:
     return poses
 
 
+@functools.cache
 def _x(k: int) -> int:
     return int(symbol("x", k))
 
 
+@functools.cache
 def _q(j: int) -> int:
     return int(symbol("q", j))
 

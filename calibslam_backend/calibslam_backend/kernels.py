@@ -38,8 +38,8 @@ def load_kernels() -> None:
         np.eye(4), vector[None, :3].copy(), np.eye(3)[None], K, bounds[2:].copy(), bounds[None].copy(), everything
     )
     squared_distances(
-        np.eye(4), vector[None], K, bounds[2:].copy(), bounds[None].copy(), np.eye(4)[None], bounds[None].copy(),
-        ~ALL_EDGES[None], 0.1
+        np.eye(4), vector[None], np.eye(3)[None], K, bounds[2:].copy(), bounds[None].copy(), np.eye(4)[None],
+        bounds[None].copy(), ~ALL_EDGES[None], 0.1
     )  # fmt: skip
     localise(poses[0].matrix(), np.eye(6), [values.atVector(1)], boxes[:1], K, 1.0, 1.0)
     # What is loaded by now stays: a full collection that looks at all of it would hold up an update by 0.1 s.

@@ -32,6 +32,9 @@ POSE, QUADRIC = slice(0, 6), slice(6, 15)
 # L is stored as (L11, L22, L33, sqrt2 L12, sqrt2 L13, sqrt2 L23): its length is the Frobenius norm of L.
 _ROWS, _COLUMNS = np.array([0, 1, 2, 0, 0, 1]), np.array([0, 1, 2, 1, 2, 2])
 _ROOT2 = np.sqrt(2.0)
+# Which entry of the vector (6,) each of the nine of the matrix is, and times what.
+_ENTRIES = np.array([0, 3, 4, 3, 1, 5, 4, 5, 2])
+_SCALES = np.where(_ENTRIES < 3, 1.0, 1.0 / _ROOT2)
 
 
 @dataclass(frozen=True)
@@ -68,9 +71,8 @@ def vector_from_matrix(L: Array) -> Array:
 
 
 def matrix_from_vector(v: Array) -> Array:
-    """(6,) -> symmetric (3, 3)."""
-    a, b, c = v[3:] / _ROOT2
-    return np.array([[v[0], a, b], [a, v[1], c], [b, c, v[2]]])
+    """(..., 6) -> symmetric (..., 3, 3)."""
+    return np.asarray((v[..., _ENTRIES] * _SCALES).reshape(*v.shape[:-1], 3, 3))
 
 
 @numba.njit(cache=True)

@@ -23,57 +23,78 @@ from calibslam_msgs_py.measurements import Array
 COHERENCE = 10.0  # bonus of a pair if all boxes of the track go to that quadric, half of it is lost if none
 
 
-def revise(
-    T_map_camera: Array,
-    boxes: Sequence[Array],
-    classes: Sequence[str],
-    by_track: Sequence[Counter[int]],
-    quadrics: Array,
-    ids: Sequence[int],
-    classes_of: Sequence[Counter[str]],
-    K: Array,
-    image: tuple[int, int],
-    settings: AssociationSettings,
-) -> list[int | None]:
-    """For each of N boxes of a keyframe the id of its quadric, or None.
+class Revision:
+    """The map as it is known now, by which boxes are judged."""
 
-    Args:
-        T_map_camera: (4, 4) of the keyframe.
-        boxes: corners (N, 4), whiteners (N, 4, 4), bounds (N, 4) and clip (N, 4) of N boxes.
-        classes: N, that they carry.
-        by_track: N; to which quadrics the boxes of the same track are given at present, how often.
-        quadrics: (M, 9) vectors.
-        ids: M.
-        classes_of: M, how many boxes of the quadric have which class.
-        K: (3, 3) camera matrix [px].
-        image: width and height [px].
-        settings: gate, model error, share of wrong classes.
-    """
-    cost = squared_distances(
-        np.ascontiguousarray(T_map_camera), quadrics, K, np.array(image, float), *boxes, settings.model_error
-    )
-    gate = gate_of(settings.gate)
-    for n, (class_id, track) in enumerate(zip(classes, by_track, strict=True)):
-        for m in np.flatnonzero(np.isfinite(cost[:, n])).tolist():
-            cost[m, n] += class_cost(classes_of[m], class_id, settings.wrong_class)
+    def __init__(
+        self,
+        quadrics: Array,
+        ids: Sequence[int],
+        classes_of: Sequence[Counter[str]],
+        K: Array,
+        image: tuple[int, int],
+        settings: AssociationSettings,
+    ) -> None:
+        """The map.
+
+        Args:
+            quadrics: (M, 9) vectors.
+            ids: M.
+            classes_of: M, how many boxes of the quadric have which class.
+            K: (3, 3) camera matrix [px].
+            image: width and height [px].
+            settings: gate, model error, share of wrong classes.
+        """
+        self._quadrics, self._ids, self._classes_of = quadrics, ids, classes_of
+        self._row = {j: m for m, j in enumerate(ids)}
+        self._shapes = shapes(quadrics)
+        self._K, self._image, self._settings = K, np.array(image, float), settings
+        self._class_costs: dict[str, Array] = {}
+
+    def judge(
+        self, T_map_camera: Array, boxes: Sequence[Array], classes: Sequence[str], by_track: Sequence[Counter[int]]
+    ) -> list[int | None]:
+        """For each of N boxes of a keyframe the id of its quadric, or None.
+
+        Args:
+            T_map_camera: (4, 4) of the keyframe.
+            boxes: corners (N, 4), whiteners (N, 4, 4), bounds (N, 4) and clip (N, 4) of N boxes.
+            classes: N, that they carry.
+            by_track: N; to which quadrics the boxes of the same track are given at present, how often.
+        """
+        T, settings = np.ascontiguousarray(T_map_camera), self._settings
+        cost = squared_distances(T, self._quadrics, self._shapes, self._K, self._image, *boxes, settings.model_error)
+        for n, (class_id, track) in enumerate(zip(classes, by_track, strict=True)):
+            cost[:, n] += self._class_cost(class_id)
             if track:
-                cost[m, n] -= COHERENCE * (track[ids[m]] / track.total() - 0.5)
-    cost[cost >= gate] = np.inf
-    result: list[int | None] = [None] * len(classes)
-    for row, column in assign(cost - gate):
-        result[column] = ids[row]
-    return result
+                cost[:, n] += 0.5 * COHERENCE
+                for j, number in track.items():
+                    cost[self._row[j], n] -= COHERENCE * number / track.total()
+        gate = gate_of(settings.gate)
+        cost[cost >= gate] = np.inf
+        result: list[int | None] = [None] * len(classes)
+        for row, column in assign(cost - gate):
+            result[column] = self._ids[row]
+        return result
+
+    def _class_cost(self, class_id: str) -> Array:
+        """(M,) cost of a class with each quadric."""
+        if class_id not in self._class_costs:
+            costs = [class_cost(classes, class_id, self._settings.wrong_class) for classes in self._classes_of]
+            self._class_costs[class_id] = np.array(costs)
+        return self._class_costs[class_id]
 
 
 @numba.njit(cache=True)
-def squared_distances(T, quadrics, K, size, corners, whiteners, bounds, clip, model_error):  # type: ignore[no-untyped-def]
-    """(M, N) squared Mahalanobis distance of N boxes to those of M quadrics; infinite if they do not overlap.
+def squared_distances(T, quadrics, surfaces, K, size, corners, whiteners, bounds, clip, model_error):  # type: ignore[no-untyped-def]
+    """(M, N) squared Mahalanobis distance of N boxes to those of M quadrics, whose surfaces are their `shapes`.
 
+    Infinite if they do not overlap.
     The covariance is that of the measurement and that of the ellipsoid as a model of the object.
     """
     result = np.full((len(quadrics), len(corners)), np.inf)
     compatible = np.ones((len(corners), len(quadrics)), np.bool_)
-    overlaps = overlaps_at(T, quadrics[:, :3].copy(), shapes(quadrics), K, size, corners, compatible)
+    overlaps = overlaps_at(T, quadrics[:, :3].copy(), surfaces, K, size, corners, compatible)
     for m in range(len(quadrics)):
         for n in range(len(corners)):
             if overlaps[n, m] == 0.0:

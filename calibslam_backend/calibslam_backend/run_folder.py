@@ -25,6 +25,7 @@ class RunRecord:
         odometry: poses (N, 4, 4) of the keyframes by odometry alone, and covariances (N, 6, 6).
         online: (N, 4, 4) each keyframe as known right after it.
         seconds: (N,) each keyframe's update.
+        between: (N,) the longest that an image since the keyframe before took.
         boxes_used, boxes_rejected: numbers.
         rejected: why, and other counts.
         associations: quadric and true identity of each box of a keyframe.
@@ -37,6 +38,7 @@ class RunRecord:
     odometry: tuple[Array, Array]
     online: Array
     seconds: Array
+    between: Array
     boxes_used: int
     boxes_rejected: int
     rejected: dict[str, int]
@@ -65,9 +67,16 @@ def accuracy(
         return {f"{prefix}{name}": None for name in ("ate_m", "rpe_m", "nees_position")}
 
 
+def milliseconds(seconds: Array) -> dict[str, float | None]:
+    """Median, 99th percentile and maximum [ms]; None of nothing."""
+    if not len(seconds):
+        return dict.fromkeys(("p50", "p99", "max"))
+    p50, p99, longest = np.percentile(np.asarray(seconds) * 1e3, [50, 99, 100])
+    return {"p50": float(p50), "p99": float(p99), "max": float(longest)}
+
+
 def metrics_of(result: ObjectMap, record: RunRecord, truth: Trajectory | None) -> dict[str, Any]:
     """The content of metrics.json."""
-    milliseconds = np.asarray(record.seconds) * 1e3
     scores = association_scores(record.associations)
     online = accuracy(result.stamps, record.online, result.covariances, truth, "online_")
     return {
@@ -79,11 +88,8 @@ def metrics_of(result: ObjectMap, record: RunRecord, truth: Trajectory | None) -
         "boxes_used": record.boxes_used,
         "boxes_rejected": record.boxes_rejected,
         "rejected": record.rejected,
-        "update_ms": {
-            "p50": float(np.percentile(milliseconds, 50)) if len(milliseconds) else None,
-            "p99": float(np.percentile(milliseconds, 99)) if len(milliseconds) else None,
-            "max": float(milliseconds.max()) if len(milliseconds) else None,
-        },
+        "update_ms": milliseconds(record.seconds),
+        "between_ms": milliseconds(record.between),
         "wall_s": record.wall_s,
         "sequence_s": record.sequence_s,
         "peak_rss_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0,

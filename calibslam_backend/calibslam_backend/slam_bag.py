@@ -23,7 +23,7 @@ from calibslam_msgs_py.bags import BagError, BagReader, BagWriter
 from calibslam_msgs_py.measurements import SECOND, Boxes, InvalidMeasurement
 from calibslam_msgs_py.settings import SettingsError, add_arguments, from_arguments
 
-MAP_PERIOD = 1.0  # [s] of recorded time between two maps in run.mcap
+MAP_PERIOD = 2.0  # [s] of recorded time between two maps in run.mcap
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -137,6 +137,7 @@ def run_record(
         odometry=estimator.odometry(),
         online=np.reshape([keyframe.T_map_camera for keyframe in keyframes], (-1, 4, 4)),
         seconds=np.array([keyframe.seconds for keyframe in keyframes]),
+        between=np.array([keyframe.between for keyframe in keyframes]),
         boxes_used=estimator.boxes_used,
         boxes_rejected=sum(rejections.values()),
         rejected={**rejections, **{k: n for k, n in counts.items() if not k.startswith("rejected_")}},

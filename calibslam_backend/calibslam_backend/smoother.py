@@ -2,6 +2,13 @@
 
 ISAM2 knows a factor by the slot it was given. Here every factor has a name, under which it can be taken out again, and
 is kept: the tree can be built anew from all of them, or handed to Levenberg-Marquardt, at any time.
+
+The tree holds tangents: a factor is linearised once, at the newest estimate of its variables, and again when it is
+renewed. ISAM2 would relinearise variables, each with all of its factors, and a variable with hundreds of factors drags
+most of the tree along; tangents can be renewed a few at a time. All of a factor's variables stand at their newest
+estimates when that is done. (Were one of them held where it was long ago, residuals would be those of a
+state that never was, and robust weights with them.) ISAM2 still moves the base of the coordinates of poses that have
+gone far, since the tangent of a rotation is that of a vector space only nearby.
 """
 
 from __future__ import annotations
@@ -26,7 +33,7 @@ class Smoother:
     CONVERGED = 1e-5  # share by which an iteration of the batch optimiser has to lower the error
 
     def __init__(self, thresholds: dict[str, tuple[int, float]]) -> None:
-        """`thresholds`: for each letter of keys the dimension of its variables and the change that relinearises."""
+        """`thresholds`: for each letter of keys the dimension of its variables and the change that moves their base."""
         self._thresholds = thresholds
         self.values = gtsam.Values()
         self._factors: dict[Name, gtsam.NonlinearFactor] = {}
@@ -67,6 +74,12 @@ class Smoother:
         else:
             self._new.remove(name)
 
+    def renew(self, name: Name) -> None:
+        """Linearise a factor anew with the next update."""
+        if name in self._slots:
+            self._to_remove.append(self._slots.pop(name))
+            self._new.append(name)
+
     def has(self, name: Name) -> bool:
         """Whether a factor is in the tree, updates done."""
         return name in self._slots
@@ -78,7 +91,7 @@ class Smoother:
 
         Args:
             last: keys to eliminate last.
-            held: keys that keep their linearisation point whatever they have moved.
+            held: keys that keep their base whatever they have moved.
 
         Raises:
             RuntimeError: GTSAM's, for example of an indeterminate system; the tree is then no longer usable.
@@ -94,7 +107,7 @@ class Smoother:
         for key in held:
             kept.push_back(key)
         changes.noRelinKeys = kept
-        result = self._isam.update(self._graph(self._new), self._new_values, changes)
+        result = self._isam.update(self._tangents(self._new), self._new_values, changes)
         self._slots.update(zip(self._new, result.getNewFactorsIndices(), strict=True))
         self._begin()
         self.values = self._isam.calculateEstimate()
@@ -135,7 +148,7 @@ class Smoother:
         self._begin()
         self._slots.clear()
         self._new = list(self._factors)
-        self._new_values = values
+        self.values = self._new_values = values
         self.update(last, ())
 
     def marginal(self, key: int) -> Array:
@@ -152,6 +165,13 @@ class Smoother:
         self._new = []
         self._new_values = gtsam.Values()
         self._to_remove = []
+
+    def _tangents(self, names: Iterable[Name]) -> gtsam.NonlinearFactorGraph:
+        graph = gtsam.NonlinearFactorGraph()
+        for name in names:
+            tangent = self._factors[name].linearize(self.values)
+            graph.push_back(gtsam.LinearContainerFactor(tangent, self.values))
+        return graph
 
     def _graph(self, names: Iterable[Name]) -> gtsam.NonlinearFactorGraph:
         graph = gtsam.NonlinearFactorGraph()

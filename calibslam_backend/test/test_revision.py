@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from calibslam_backend.association import AssociationSettings, class_cost
-from calibslam_backend.quadric import ALL_EDGES, Ellipsoid, box_of_visible_part, image_bounds
-from calibslam_backend.revision import COHERENCE, revise, squared_distances
+from calibslam_backend.quadric import ALL_EDGES, Ellipsoid, box_of_visible_part, image_bounds, shapes
+from calibslam_backend.revision import COHERENCE, Revision, squared_distances
 from calibslam_msgs_py.measurements import Array
 
 K = np.array([[500.0, 0.0, 320.0], [0.0, 500.0, 240.0], [0.0, 0.0, 1.0]])
@@ -39,7 +39,7 @@ QUADRICS = np.stack([at(-0.05), at(0.05)])
 
 
 def arrays(boxes: Sequence[Array]) -> list[Array]:
-    """Corners, whiteners, bounds and clip of boxes, as `revise` takes them."""
+    """Corners, whiteners, bounds and clip of boxes, as `Revision.judge` takes them."""
     n = len(boxes)
     whiteners, clip = np.tile(np.eye(4) / SIGMA, (n, 1, 1)), np.zeros((n, 4), bool)
     return [np.reshape(boxes, (n, 4)), whiteners, np.tile(BOUNDS, (n, 1)), clip]
@@ -53,18 +53,9 @@ def whose(
     settings: AssociationSettings = SETTINGS,
 ) -> list[int | None]:
     """The quadric of each box, the camera being at the origin."""
-    return revise(
-        np.eye(4),
-        arrays(boxes),
-        classes or ["cup"] * len(boxes),
-        tracks or [Counter()] * len(boxes),
-        QUADRICS,
-        [LEFT, RIGHT],
-        classes_of,
-        K,
-        (640, 480),
-        settings,
-    )
+    revision = Revision(QUADRICS, [LEFT, RIGHT], classes_of, K, (640, 480), settings)
+    n = len(boxes)
+    return revision.judge(np.eye(4), arrays(boxes), classes or ["cup"] * n, tracks or [Counter()] * n)
 
 
 def test_boxes_go_to_the_quadrics_they_fit() -> None:
@@ -130,10 +121,11 @@ def test_distances_by_hand() -> None:
     """q = sum of (edge / sigma)^2, sigma^2 = 3^2 + (0.1 * 50)^2 with a model error of a tenth of the box."""
     box = seen(QUADRICS[0]) + np.array([1.0, 2.0, -3.0, 4.0])
     stacked = arrays([box])
-    found = squared_distances(np.eye(4), QUADRICS, K, np.array([640.0, 480.0]), *stacked, 0.1)
+    image = np.array([640.0, 480.0])
+    found = squared_distances(np.eye(4), QUADRICS, shapes(QUADRICS), K, image, *stacked, 0.1)
     size = seen(QUADRICS[0])[2:] - seen(QUADRICS[0])[:2]
     variance = SIGMA**2 + (0.1 * np.tile(size, 2)) ** 2
     assert found.shape == (2, 1)
     assert found[0, 0] == pytest.approx((np.array([1.0, 4.0, 9.0, 16.0]) / variance).sum(), rel=1e-9)
     behind = np.diag([1.0, -1.0, -1.0, 1.0])
-    assert np.isinf(squared_distances(behind, QUADRICS, K, np.array([640.0, 480.0]), *stacked, 0.1)).all()
+    assert np.isinf(squared_distances(behind, QUADRICS, shapes(QUADRICS), K, image, *stacked, 0.1)).all()

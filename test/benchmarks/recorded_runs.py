@@ -43,7 +43,11 @@ def office_rows(folder: Path, scratch: Path, repetitions: int) -> list[AnyRow]:
     found: dict[str, Any] = runs[0]
     batch: dict[str, Any] = slam_bag(bag, scratch / f"{OFFICE} batch", EstimatorSettings(), batch=True)
     association = found["association"]
-    fastest = {name: min(run["update_ms"][name] for run in runs) for name in ("p50", "p99", "max")}  # type: ignore[index]
+    # What a keyframe leaves to be done is done with the images after it: neither may stall.
+    fastest = {
+        name: min(max(run[kind][name] for kind in ("update_ms", "between_ms")) for run in runs)  # type: ignore[index]
+        for name in ("p50", "p99", "max")
+    }
     speed = max(run["sequence_s"] / run["wall_s"] for run in runs)  # type: ignore[operator]
     note = f"best of {repetitions} runs" if repetitions > 1 else ""
     return [
