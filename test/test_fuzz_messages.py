@@ -143,7 +143,7 @@ def test_spoilt_bytes(kind: str) -> None:
 
 def test_the_estimator_among_spoilt_messages() -> None:
     """What passes the checks of a message may still be nonsense: it must not make the estimate unusable."""
-    fuzz(drive_among_spoilt_messages, few=4, many=300, seconds=120.0)
+    fuzz(drive_among_spoilt_messages, few=4, many=300)
 
 
 def drive_among_spoilt_messages(random: Random) -> None:

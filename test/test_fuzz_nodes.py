@@ -27,6 +27,7 @@ from valid_messages import VALID
 from calibslam_detector import weights_file
 from calibslam_detector.network import CalibratedDetector
 from calibslam_msgs_py.conversions import RosTypes
+from calibslam_msgs_py.settings import SettingsError
 
 TYPES = RosTypes()
 NEED_A_FILE = {"weights": "weights.pt", "out": "recorded.mcap"}  # parameter -> file in the test's folder
@@ -61,13 +62,18 @@ def node(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.Mon
     source = inspect.getsource(importlib.import_module(NODES[request.param].__module__))
     given_files = [f"{name}:={tmp_path / file}" for name, file in NEED_A_FILE.items() if f"    {name}: str" in source]
     rclpy.init(args=["--ros-args", *(part for text in given_files for part in ("-p", text))])
-    made = NODES[request.param]()
+    made: Node | None = None
     try:
+        try:
+            made = NODES[request.param]()
+        except SettingsError as error:
+            pytest.skip(str(error))  # it takes messages of a package that is not there
         yield made
     finally:
-        if hasattr(made, "close"):
+        if made is not None and hasattr(made, "close"):
             made.close()
-        made.destroy_node()
+        if made is not None:
+            made.destroy_node()
         rclpy.try_shutdown()
 
 
@@ -75,8 +81,10 @@ def test_nodes_are_found() -> None:
     assert {"backend", "calibrator", "detector", "odometry", "record"} <= NODES.keys()
 
 
-def deliver(receive: Callable[[Any], None], valid: Any, random: Random) -> None:
-    receive(spoilt_message(valid, random, lengths_too=False))
+def deliver(receive: Callable[[Any], None], encode: Callable[[Any], Any], valid: Any, random: Random) -> None:
+    receive(encode(spoilt_message(valid, random, lengths_too=False)))
+    if encode is serialize_message:
+        receive(spoilt_bytes(serialize_message(valid), random))
 
 
 def test_every_input_among_spoilt_messages(node: Node) -> None:
@@ -84,10 +92,12 @@ def test_every_input_among_spoilt_messages(node: Node) -> None:
     assert subscriptions, "no input of this node is known to `valid_messages`"
     for subscription in subscriptions:
         valid = VALID[message_name(subscription.msg_type)](TYPES)
+        # Some decode messages themselves, to count what cannot be decoded.
+        encode = serialize_message if subscription.raw else lambda message: message
         receive: Callable[[Any], None] = subscription.callback
-        receive(valid)
-        fuzz(partial(deliver, receive, valid), few=15, many=400)
-        receive(valid)
+        receive(encode(valid))
+        fuzz(partial(deliver, receive, encode, valid), few=15, many=400)
+        receive(encode(valid))
     assert not getattr(node, "_counters", {"errors": 0})["errors"]
 
 

@@ -60,13 +60,16 @@ class Robot:
         """Until the back end listens."""
         wait_until(lambda: self._camera.get_subscription_count() == 1, lambda: f"no back end: {process.output}")
 
+    def camera(self) -> None:
+        self._camera.publish(camera_to_msg(CAMERA, 0, TYPES))
+
     def drive(self, start: int = 0, end: int = 150) -> None:
         motions, boxes = WORLD.motions(), WORLD.boxes()
         for k in range(start, end):
             if k:
                 self._motions.publish(motion_to_msg(motions[k - 1], TYPES))
             time.sleep(PACE)
-            self._camera.publish(camera_to_msg(CAMERA, boxes[k].stamp, TYPES))
+            self.camera()
             self._boxes.publish(boxes_to_msg(boxes[k], TYPES))
             time.sleep(PACE)
             self.sent = k + 1
@@ -147,33 +150,40 @@ def test_the_map_is_saved_at_the_end_and_started_in_where_told(tmp_path: Path) -
     """At SIGTERM; and the pose that is given on /initialpose is where the trajectory begins in that map."""
     domain = random_domain()
     inside = ("-p", f"map_folder:={tmp_path}")
-    with Watcher(domain) as watcher:
+    with (
+        Watcher(domain) as watcher,
+        backend(domain, tmp_path / "journal", *inside, "-p", "save_at_exit:=end/map.json") as process,
+    ):
+        robot = Robot(watcher)
+        robot.wait(process)
+        robot.drive()
+        wait_until(lambda: watcher.counts("/backend").get("images") == "150", lambda: process.output)
+        assert process.end(signal.SIGTERM) == 0, process.output
+        assert "saved: " in process.output
+    saved = json.loads((tmp_path / "end" / "map.json").read_text())
+    assert len(saved["quadrics"]) == 9 and len(saved["keyframes"]) > 15
+    pose = StampedPose(0, pose_of(saved["keyframes"][0]))
+    pose.T[:3, 3] += [0.2, -0.2, 0.1]
+    domain = random_domain()
+    with Watcher(domain) as watcher, backend(domain, tmp_path / "new journal", *inside) as process:
         watcher.listen(PathMessage, "/trajectory")
         robot = Robot(watcher)
-        with backend(domain, tmp_path / "journal", *inside, "-p", "save_at_exit:=end/map.json") as process:
-            robot.wait(process)
-            robot.drive()
-            wait_until(lambda: watcher.counts("/backend").get("images") == "150", lambda: process.output)
-            assert process.end(signal.SIGTERM) == 0, process.output
-            assert "saved: " in process.output
-        saved = json.loads((tmp_path / "end" / "map.json").read_text())
-        assert len(saved["quadrics"]) == 9 and len(saved["keyframes"]) > 15
         start = watcher.node.create_publisher(PoseWithCovarianceStamped, "initialpose", 10)
-        pose = StampedPose(0, pose_of(saved["keyframes"][0]))
-        pose.T[:3, 3] += [0.2, -0.2, 0.1]
-        with backend(domain, tmp_path / "new journal", *inside) as process:
-            wait_until(lambda: start.get_subscription_count() == 1, "the back end does not subscribe")
-            wait_until(lambda: watcher.counts("/backend").get("images") == "150", lambda: process.output)
-            assert watcher.call(LoadMap, "/backend/load_map", path="end/map.json").success
-            start.publish(pose_with_covariance_to_msg(pose, None, "odom", TYPES))
-            start.publish(pose_with_covariance_to_msg(pose, None, "map", TYPES))
-            wait_until(lambda: "rejected_frame" in watcher.counts("/backend"), lambda: f"{watcher.counts('/backend')}")
-            robot.drive()
-            wait_until(lambda: watcher.counts("/backend").get("images") == "300", lambda: process.output)
-            wait_until(lambda: len(watcher.last["/trajectory"].poses) > 15, "there is no new trajectory")
-            last = trajectory_of(watcher.last["/trajectory"]).poses[-1]
-            assert np.linalg.norm(last[:3, 3] - pose_of(saved["keyframes"][-1])[:3, 3]) < 0.1
-            assert process.end() == 0, process.output
+        robot.wait(process)
+        wait_until(lambda: start.get_subscription_count() == 1, "the back end does not subscribe")
+        robot.camera()
+        wait_until(lambda: watcher.call(LoadMap, "/backend/load_map", path="end/map.json").success, "not loaded")
+        start.publish(pose_with_covariance_to_msg(pose, None, "odom", TYPES))
+        start.publish(pose_with_covariance_to_msg(pose, None, "map", TYPES))
+        wait_until(lambda: "rejected_frame" in watcher.counts("/backend"), lambda: f"{watcher.counts('/backend')}")
+        robot.drive()
+        wait_until(lambda: watcher.counts("/backend").get("images") == "150", lambda: process.output)
+        end = pose_of(saved["keyframes"][-1])[:3, 3]
+        wait_until(
+            lambda: np.linalg.norm(trajectory_of(watcher.last["/trajectory"]).poses[-1][:3, 3] - end) < 0.1,
+            "the new trajectory does not end where the first one did",
+        )
+        assert process.end() == 0, process.output
 
 
 def pose_of(keyframe: dict[str, Any]) -> Array:

@@ -123,16 +123,16 @@ def _copied_topics(
 ) -> list[str]:
     """The topics that are copied as they are; they are made in the new bag."""
     replaced = {settings.topic} | ({OVERLAY} if settings.overlay else set())
+    usable = writer.adopt(reader)
     copied = []
     for name, kind in reader.topics.items():
         if name in replaced or (name == image_topic and not settings.images):
             continue
-        try:
-            writer.add_topic(name, kind)
-        except BagError:
-            left_out[f"topic {name} of unknown type {kind}"] += reader.counts[name]
-        else:
-            copied.append(name)
+        if name not in usable:
+            left_out[f"topic {name}, whose type {kind} is not defined in the bag"] += reader.counts[name]
+            continue
+        writer.add_topic(name, kind)
+        copied.append(name)
     return copied
 
 

@@ -22,7 +22,7 @@ SETUP = Path(__file__).resolve().parents[1] / "setup.py"
 def test_file_is_small_half_precision_and_plain_data() -> None:
     assert weights_file.SHIPPED.stat().st_size < MOST_BYTES
     content = torch.load(weights_file.SHIPPED, weights_only=True)
-    assert content["architecture"] == "compact"
+    assert content["architecture"] == "compact" and content["boxes"] == "amodal_bbox"
     kinds = {value.dtype for value in content["weights"].values()}
     assert kinds == {torch.float16, torch.int64}  # int64: counts of batches
 

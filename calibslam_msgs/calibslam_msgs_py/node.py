@@ -232,14 +232,16 @@ def subscribe(
 ) -> None:
     """A subscription whose quality of service can be overridden by parameters.
 
-    What the middleware loses is counted as `lost_TOPIC`; a publisher that it cannot connect to is named in a warning.
+    What the middleware loses of a reliable topic is counted as `lost_TOPIC`; a publisher that it cannot connect to is
+    named in a warning.
 
     Args:
         receive: takes a message, or with `raw` its bytes.
     """
 
     def lost(info: Any) -> None:
-        counters.count(f"lost_{topic}", info.total_count_change)
+        if profile.reliability == ReliabilityPolicy.RELIABLE:  # the others may lose what they like
+            counters.count(f"lost_{topic}", info.total_count_change)
 
     node.create_subscription(
         kind,

@@ -4,18 +4,20 @@ from __future__ import annotations
 
 import faulthandler
 import os
-import sys
+import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from random import Random
 
 from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 
+HANGS = Path(tempfile.gettempdir()) / "calibslam_fuzzing_hangs.txt"
 FULL = os.environ.get("CALIBSLAM_FUZZ") == "full"
 
 
-def fuzz(body: Callable[[Random], None], few: int, many: int, seconds: float = 60.0) -> None:
+def fuzz(body: Callable[[Random], None], few: int, many: int, seconds: float = 300.0) -> None:
     """Call `body` `few` times, always with the same random numbers, or `many` times, with new ones in every run.
 
     Args:
@@ -40,9 +42,10 @@ def fuzz(body: Callable[[Random], None], few: int, many: int, seconds: float = 6
 
 @contextmanager
 def ends_within(seconds: float) -> Iterator[None]:
-    """Where what is inside hangs, the process says where and ends: no test runner waits for ever."""
-    faulthandler.dump_traceback_later(seconds, exit=True, file=sys.__stderr__)
-    try:
-        yield
-    finally:
-        faulthandler.cancel_dump_traceback_later()
+    """Where what is inside hangs, the process ends, and `HANGS` says where: no test runner waits for ever."""
+    with HANGS.open("w") as file:
+        faulthandler.dump_traceback_later(seconds, exit=True, file=file)
+        try:
+            yield
+        finally:
+            faulthandler.cancel_dump_traceback_later()
