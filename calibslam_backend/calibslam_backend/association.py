@@ -9,7 +9,6 @@ keyframes agree: one coincidence costs nothing, one wrong binding costs the map.
 from __future__ import annotations
 
 import functools
-import math
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -114,14 +113,15 @@ def predict(
     return corners, J @ covariance @ J.T + own
 
 
-def class_cost(classes: Counter[str], class_id: str, wrong_class: float) -> float:
-    """-2 log of the probability that a box of a quadric whose boxes have these classes carries `class_id`.
+def class_costs(classes: Sequence[Counter[str]], class_id: str, wrong_class: float) -> Array:
+    """(M,) -2 log of the probability that a box of M quadrics, whose boxes have these classes, carries `class_id`.
 
     Up to a constant: the boxes' own frequencies, mixed with a share of wrong classes.
     """
-    total = classes.total()
-    share = classes[class_id] / total if total else 0.0
-    return -2.0 * math.log((1.0 - wrong_class) * share + wrong_class)
+    number = np.array([each[class_id] for each in classes], float)
+    total = np.array([each.total() for each in classes], float)
+    share = number / np.maximum(total, 1.0)
+    return np.asarray(-2.0 * np.log((1.0 - wrong_class) * share + wrong_class))
 
 
 def distances(
@@ -182,18 +182,18 @@ class Votes:
         self._votes.pop(track, None)
 
 
-def same_object(vector: Array, others: Array, merge_distance: float) -> NDArray[np.bool_]:
-    """Which of M quadrics (M, 9) are so close to one (9,), and so alike in size, that they are one object."""
-    distances = np.linalg.norm(others[:, :3] - vector[:3], axis=1)
-    size, sizes = mean_radius(vector), mean_radius(others)
-    alike = np.maximum(size, sizes) < SIZE_RATIO * np.minimum(size, sizes)
-    return np.asarray(alike & (distances < merge_distance * (size + sizes)))
+def same_object(a: Array, b: Array, merge_distance: float) -> NDArray[np.bool_]:
+    """Whether quadrics a (..., 9) and b (..., 9) are so near and so alike in size that they are one object."""
+    distances = np.linalg.norm(a[..., :3] - b[..., :3], axis=-1)
+    size, other = mean_radius(a), mean_radius(b)
+    alike = np.maximum(size, other) < SIZE_RATIO * np.minimum(size, other)
+    return np.asarray(alike & (distances < merge_distance * (size + other)))
 
 
-def at_one_place(vector: Array, others: Array) -> NDArray[np.bool_]:
-    """Which of M quadrics (M, 9) have their centres so near to that of one (9,) that they cannot be two things.
+def at_one_place(a: Array, b: Array) -> NDArray[np.bool_]:
+    """Whether the centres of quadrics a (..., 9) and b (..., 9) are so near that they cannot be two things.
 
     Two objects of a class do not stand in each other: a detector that draws two boxes there has seen one twice.
     """
-    distances = np.linalg.norm(others[:, :3] - vector[:3], axis=1)
-    return np.asarray(distances < ONE_PLACE * np.minimum(mean_radius(vector), mean_radius(others)))
+    distances = np.linalg.norm(a[..., :3] - b[..., :3], axis=-1)
+    return np.asarray(distances < ONE_PLACE * np.minimum(mean_radius(a), mean_radius(b)))

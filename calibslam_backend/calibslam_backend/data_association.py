@@ -363,35 +363,33 @@ class DataAssociation:
             if number >= self.settings.votes and 2 * number > len(candidate.seen):
                 candidate.quadric = j
 
-    def merge(self) -> list[int]:
-        """Quadrics that have become one object; the younger goes."""
+    def merge(self) -> None:
+        """Unite quadrics that have become one object; the younger goes."""
         if self.settings.association == GIVEN:
-            return []
-        gone = []
+            return
         for j, known in self._same:
             if j in self._graph.landmarks and known in self._graph.landmarks:
                 self._unite(j, known)
-                gone.append(j)
         self._same.clear()
         ids = sorted(self._graph.landmarks)
         if not ids:
-            return gone
+            return
         vectors = np.stack([self._graph.quadric(j) for j in ids])
-        for m in reversed(range(len(ids))):
-            # An older quadric of its place, size and class, never seen beside it, is the same object; even one that was
-            # seen beside it, if both have settled at one place.
-            inside = at_one_place(vectors[m], vectors[:m]) & self._is_settled(ids[m])
-            for n in np.flatnonzero(same_object(vectors[m], vectors[:m], self.settings.merge_distance) | inside):
-                j, older = ids[m], ids[n]
-                boxes, others = (self._graph.landmarks[i].boxes.keys() for i in (j, older))
-                alike = self.class_of_quadric(older) == self.class_of_quadric(j)
-                if alike and (inside[n] or not _apart(boxes, others)):
-                    self._unite(j, older)
-                    gone.append(j)
-                    break
-        return gone
+        pairs = vectors[:, None], vectors[None]
+        # An older quadric of its place, size and class, never seen beside it, is the same object; even one seen beside
+        # it, if both have settled at one place.
+        inside = at_one_place(*pairs) & np.array([[self._is_settled(j)] for j in ids])
+        gone = set()
+        for m, n in np.argwhere(np.tril(same_object(*pairs, self.settings.merge_distance) | inside, -1))[::-1]:
+            j, older = ids[m], ids[n]
+            if j in gone or self.class_of_quadric(older) != self.class_of_quadric(j):
+                continue
+            if inside[m, n] or not _apart(*(self._graph.landmarks[i].boxes.keys() for i in (j, older))):
+                self._unite(j, older)
+                gone.add(j)
 
     def _is_settled(self, j: int) -> bool:
+        """Whether a quadric is no longer young."""
         return len(self.frames) - self._graph.landmarks[j].born > self.YOUNG
 
     def spread_over_all(self) -> None:

@@ -309,7 +309,7 @@ class Estimator:
         began = time.perf_counter()
         turned = np.eye(3)
         if self._last_frame is not None:
-            turned = self._motions.between(self._last_frame, boxes.stamp)[0][:3, :3].T
+            turned = self._motions.motion(self._last_frame, boxes.stamp)[:3, :3].T
         self._last_frame = boxes.stamp
         boxes, tracks = self._tracks(boxes, turned)
         motion = found = None
@@ -322,14 +322,14 @@ class Estimator:
                 return None
         if self.stamps:
             interval = self.stamps[-1], boxes.stamp
-            motion = Motion(
-                *self._motions.between(*interval), self._motions.drifts(*interval), self._motions.measured(*interval)
-            )
-            if not self._moved(motion.T, boxes.stamp - self.stamps[-1]):
+            if not self._moved(self._motions.motion(*interval), boxes.stamp - self.stamps[-1]):
                 if self._chores:
                     self._chores.pop(0)()
                 self._between = max(self._between, time.perf_counter() - began)
                 return None
+            motion = Motion(
+                *self._motions.between(*interval), self._motions.drifts(*interval), self._motions.measured(*interval)
+            )
         return self._keyframe(boxes, tracks, motion, found, began)
 
     def _tracks(self, boxes: Boxes, R_now_before: Array) -> tuple[Boxes, list[int]]:
@@ -368,7 +368,7 @@ class Estimator:
         self._sighting = boxes.stamp, found.T_map_camera
         motion = np.eye(4)
         if before is not None:
-            motion, _ = self._motions.between(before[0], boxes.stamp)
+            motion = self._motions.motion(before[0], boxes.stamp)
         self._motions.forget_before(boxes.stamp)
         if before is None:
             return None

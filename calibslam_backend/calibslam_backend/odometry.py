@@ -234,11 +234,12 @@ class MotionChain:
             (axes * np.where(variances > self.OPEN**2, np.minimum(variances, unseen), variances)) @ axes.T
         )
 
-    def between(self, start: int, end: int) -> tuple[Array, Array]:
-        """Motion (4, 4) of the camera and its covariance (6, 6) [rotation, translation] from start to end [ns].
+    def motion(self, start: int, end: int) -> Array:
+        """(4, 4) of the camera from start to end [ns], which must lie inside the chain."""
+        return np.asarray(self._pose_at(start, self._poses).between(self._pose_at(end, self._poses)).matrix())
 
-        Both times must lie inside the chain.
-        """
+    def between(self, start: int, end: int) -> tuple[Array, Array]:
+        """`motion` and its covariance (6, 6) [rotation, translation]."""
         first, last = self._pose_at(start, self._poses), self._pose_at(end, self._poses)
         motion = first.between(last)
         covariance, unseen, unknown = np.zeros((6, 6)), 0.0, False

@@ -150,16 +150,17 @@ def _by_three(points: Array, quadrics: Array, compatible: NDArray[np.bool_]) -> 
     lengths = [np.linalg.norm(p - np.roll(p, 1, axis=1), axis=2) for p in (here, there)]
     agree = (np.abs(lengths[0] - lengths[1]) <= LENGTH_ERROR * lengths[1]).all(axis=1)
     chosen = np.flatnonzero(different[0] & different[1] & agree)[:TRIPLES]
-    return [_rigid(here[i], there[i]) for i in chosen]
+    return list(_rigid(here[chosen], there[chosen]))
 
 
 def _rigid(here: Array, there: Array) -> Array:
-    """(4, 4) T with there = T here, least squares (Umeyama 1991, without scale)."""
-    a, b = here.mean(axis=0), there.mean(axis=0)
-    U, _, Vt = np.linalg.svd((there - b).T @ (here - a))
-    T = np.eye(4)
-    T[:3, :3] = U @ np.diag([1.0, 1.0, np.sign(np.linalg.det(U @ Vt))]) @ Vt
-    T[:3, 3] = b - T[:3, :3] @ a
+    """(N, 4, 4) T with there = T here for N sets of points (N, M, 3), least squares (Umeyama 1991, without scale)."""
+    a, b = here.mean(axis=1), there.mean(axis=1)
+    U, _, Vt = np.linalg.svd((there - b[:, None]).transpose(0, 2, 1) @ (here - a[:, None]))
+    U[:, :, 2] *= np.linalg.det(U @ Vt)[:, None]
+    T = np.tile(np.eye(4), (len(here), 1, 1))
+    T[:, :3, :3] = U @ Vt
+    T[:, :3, 3] = b - np.einsum("nij,nj->ni", T[:, :3, :3], a)
     return T
 
 

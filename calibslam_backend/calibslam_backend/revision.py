@@ -15,7 +15,7 @@ from collections.abc import Sequence
 import numba
 import numpy as np
 
-from calibslam_backend.association import AssociationSettings, assign, class_cost, gate_of
+from calibslam_backend.association import AssociationSettings, assign, class_costs, gate_of
 from calibslam_backend.quadric import box_of_visible_part, shapes
 from calibslam_backend.relocalisation import overlaps_at
 from calibslam_msgs_py.measurements import Array
@@ -80,8 +80,7 @@ class Revision:
     def _class_cost(self, class_id: str) -> Array:
         """(M,) cost of a class with each quadric."""
         if class_id not in self._class_costs:
-            costs = [class_cost(classes, class_id, self._settings.wrong_class) for classes in self._classes_of]
-            self._class_costs[class_id] = np.array(costs)
+            self._class_costs[class_id] = class_costs(self._classes_of, class_id, self._settings.wrong_class)
         return self._class_costs[class_id]
 
 

@@ -17,7 +17,8 @@ from calibslam_backend.association import (
     Prediction,
     Votes,
     assign,
-    class_cost,
+    at_one_place,
+    class_costs,
     distances,
     predict,
     same_object,
@@ -103,13 +104,13 @@ def test_a_wrong_class_costs_its_odds_and_little_overlap_is_no_match() -> None:
 
 def test_cost_of_a_class_by_hand() -> None:
     """Of 10 boxes 8 are cups and 2 are bottles: -2 log(0.95 share + 0.05)."""
-    classes = Counter(cup=8, bottle=2)
-    assert class_cost(classes, "cup", 0.05) == pytest.approx(-2.0 * np.log(0.81))
-    assert class_cost(classes, "bottle", 0.05) == pytest.approx(-2.0 * np.log(0.24))
-    assert class_cost(classes, "book", 0.05) == pytest.approx(-2.0 * np.log(0.05))
+    quadrics = [Counter(cup=8, bottle=2), Counter(), Counter(cup=3, book=0)]
+    costs = {name: class_costs(quadrics, name, 0.05) for name in ("cup", "bottle", "book")}
+    shares = {"cup": [0.81, 0.05, 1.0], "bottle": [0.24, 0.05, 0.05], "book": [0.05, 0.05, 0.05]}
     # Of nothing known, every class is as likely; boxes that were taken away again count as none.
-    assert class_cost(Counter(), "cup", 0.05) == class_cost(Counter(), "book", 0.05)
-    assert class_cost(Counter(cup=3, book=0), "book", 0.05) == pytest.approx(-2.0 * np.log(0.05))
+    for name, expected in shares.items():
+        np.testing.assert_allclose(costs[name], -2.0 * np.log(expected))
+    assert class_costs([], "cup", 0.05).shape == (0,)
 
 
 def test_the_surer_landmark_is_not_always_the_nearer_one() -> None:
@@ -160,12 +161,13 @@ def test_votes_by_hand() -> None:
     assert votes.add(1, 5) is None
 
 
-def test_same_objects_are_near_and_alike() -> None:
-    def at(x: float, radius: float) -> Array:
-        T = np.eye(4)
-        T[0, 3] = x
-        return Ellipsoid(T, np.full(3, radius)).vector()
+def at(x: float, radius: float) -> Array:
+    T = np.eye(4)
+    T[0, 3] = x
+    return Ellipsoid(T, np.full(3, radius)).vector()
 
+
+def test_same_objects_are_near_and_alike() -> None:
     # The centres may be 0.7 of the two radii apart: 0.14 m.
     others = [at(0.13, 0.1), at(0.15, 0.1), at(0.0, 0.1 * SIZE_RATIO * 0.99), at(0.0, 0.1 * SIZE_RATIO * 1.01)]
     assert same_object(at(0.0, 0.1), np.stack(others), 0.7).tolist() == [True, False, True, False]
@@ -177,3 +179,12 @@ def test_what_another_would_suit_nearly_as_well_is_not_decided() -> None:
     assert unambiguous(cost, pairs, 2.5) == [(1, 1), (1, 2)]
     assert unambiguous(cost, pairs, 2.0) == pairs
     assert unambiguous(cost[:1], [(0, 0)], 9.0) == [(0, 0)]
+
+
+def test_two_objects_of_a_class_need_two_places() -> None:
+    """Centres nearer than half the mean radius of the smaller; all pairs at once."""
+    vectors = np.stack([at(0.0, 0.1), at(0.03, 0.08), at(0.045, 0.08), at(0.0, 0.5)])
+    assert at_one_place(vectors[0], vectors).tolist() == [True, True, False, True]
+    assert at_one_place(vectors[:, None], vectors[None]).tolist() == [
+        [True, True, False, True], [True, True, True, True], [False, True, True, False], [True, True, False, True],
+    ]  # fmt: skip

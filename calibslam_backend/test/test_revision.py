@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from calibslam_backend.association import AssociationSettings, class_cost
+from calibslam_backend.association import AssociationSettings, class_costs
 from calibslam_backend.quadric import ALL_EDGES, Ellipsoid, box_of_visible_part, image_bounds, shapes
 from calibslam_backend.revision import COHERENCE, Revision, squared_distances
 from calibslam_msgs_py.measurements import Array
@@ -88,7 +88,7 @@ def test_a_box_of_nothing_stays_open() -> None:
 @pytest.mark.parametrize(("share", "expected"), [(0.99, LEFT), (1.01, None)])
 def test_the_gate_by_hand(share: float, expected: int | None) -> None:
     """Two edges moved by d: q = 2 (d / sigma)^2. Away from the neighbour."""
-    d = share * SIGMA * np.sqrt(0.5 * (GATE - class_cost(CUPS, "cup", SETTINGS.wrong_class)))
+    d = share * SIGMA * np.sqrt(0.5 * (GATE - class_costs([CUPS], "cup", SETTINGS.wrong_class)[0]))
     assert whose([seen(QUADRICS[0]) - d * np.array([1, 0, 1, 0])]) == [expected]
 
 
@@ -112,7 +112,7 @@ def test_the_track_decides_a_tie() -> None:
 @pytest.mark.parametrize(("share", "expected"), [(0.98, LEFT), (1.02, None)])
 def test_the_bonus_of_coherence_by_hand(share: float, expected: int | None) -> None:
     """A box whose whole track goes to a quadric is taken beyond the gate, by half of the bonus."""
-    q = GATE + 0.5 * COHERENCE - class_cost(CUPS, "cup", SETTINGS.wrong_class)
+    q = GATE + 0.5 * COHERENCE - class_costs([CUPS], "cup", SETTINGS.wrong_class)[0]
     d = share * SIGMA * np.sqrt(0.5 * q)
     assert whose([seen(QUADRICS[0]) - d * np.array([1, 0, 1, 0])], tracks=[Counter({LEFT: 5})]) == [expected]
 
