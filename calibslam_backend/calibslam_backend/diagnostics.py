@@ -22,7 +22,8 @@ def of_session(session: Session) -> Mapping[str, str]:
         values["images_waiting_for_odometry"] = str(estimator.waiting)
     if session.intake.journal_problem:
         values["journal"] = session.intake.journal_problem
-    values |= _quantiles("update_ms", session.tally.update_ms) | _quantiles("delay_ms", session.tally.delay_ms)
+    for name in ("update_ms", "between_ms", "delay_ms"):
+        values |= _quantiles(name, getattr(session.tally, name))
     if nis := list(session.tally.nis):
         # Half of the boxes lie below chi-squared's median of 0.839 where covariances are right.
         values |= {"nis_mean": f"{np.mean(nis):.2f}", "nis_median": f"{np.median(nis):.2f}"}

@@ -17,6 +17,7 @@ class Tally:
 
     Attributes:
         update_ms: of updates.
+        between_ms: the longest of the images before each, which are no keyframes.
         delay_ms: from the arrival of the boxes to the end of their update.
         nis: normalised innovations squared, see `innovation`.
     """
@@ -26,6 +27,7 @@ class Tally:
         self._counts: Counter[str] = Counter()
         self._told: Counter[str] = Counter()
         self.update_ms: deque[float] = deque(maxlen=WINDOW)
+        self.between_ms: deque[float] = deque(maxlen=WINDOW)
         self.delay_ms: deque[float] = deque(maxlen=WINDOW)
         self.nis: deque[float] = deque(maxlen=WINDOW)
 
@@ -42,6 +44,7 @@ class Tally:
         for keyframe in keyframes:
             self.nis.extend(keyframe.nis)
             self.update_ms.append(keyframe.seconds * 1e3)
+            self.between_ms.append(keyframe.between * 1e3)
             if arrived:
                 self.delay_ms.append((time.monotonic() - arrived) * 1e3)
             if keyframe.repaired:
