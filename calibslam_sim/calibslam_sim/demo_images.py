@@ -38,7 +38,8 @@ def detect(bag: Path, out: Path) -> int:
     Raises:
         WeightsError: the shipped weights cannot be used.
     """
-    detector = Detector.from_file(SHIPPED, DetectorSettings())
+    # One thread: several get in each other's way where the machine has something else to do.
+    detector = Detector.from_file(SHIPPED, DetectorSettings(threads=1))
     return detect_bag(bag, out, detector, DetectBagSettings(topic=DETECTED, images=False), overwrite=True).boxes
 
 
