@@ -34,6 +34,7 @@ setup(
             f"play = {PACKAGE}.play_node:main",
             f"record = {PACKAGE}.record_node:main",
             f"render_dataset = {PACKAGE}.render_dataset:main",
+            f"report = {PACKAGE}.report:main",
             f"results = {PACKAGE}.results:main",
             f"save_map = {PACKAGE}.save_map_node:main",
             f"simulate = {PACKAGE}.simulate:main",

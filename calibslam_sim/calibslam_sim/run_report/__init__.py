@@ -1,0 +1,1 @@
+"""Runs on one page: `calibslam_sim.report` is the command line."""
