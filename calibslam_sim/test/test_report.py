@@ -313,6 +313,26 @@ def test_the_heuristic_by_hand() -> None:
     assert np.isnan(seen.calibrated()).all() and seen.often_seen() == []
 
 
+@pytest.mark.parametrize("correlation", [0.0, 0.6])
+def test_correlation_of_neighbours(correlation: float) -> None:
+    """An autoregressive error of known correlation, of two objects seen in turns; n pairs tell it to 1 / sqrt(n)."""
+    rng = np.random.default_rng(5)
+    n = 1500
+    errors = rng.normal(size=(2, n, 4))
+    for k in range(1, n):
+        errors[:, k] = correlation * errors[:, k - 1] + np.sqrt(1.0 - correlation**2) * errors[:, k]
+    image, quadric = np.tile(np.arange(n), 2), np.repeat([0, 1], n)
+    mixed = rng.permutation(2 * n)
+    sigma = 3.0
+    seen = Sightings(
+        image[mixed], image[mixed] * 0, quadric[mixed], np.zeros((2 * n, 4)), sigma * errors.reshape(-1, 4)[mixed],
+        np.tile(np.eye(4) * sigma**2, (2 * n, 1, 1)),
+    )  # fmt: skip
+    assert seen.neighbour_correlation() == pytest.approx(correlation, abs=4.0 / np.sqrt(8 * n))
+    few = Sightings(*(value[:20] for value in vars(seen).values()))
+    assert np.isnan(few.neighbour_correlation())
+
+
 def test_reliability_of_boxes_that_are_as_stated() -> None:
     """Errors drawn from the stated covariances follow the diagonal, within the band of chance."""
     rng = np.random.default_rng(3)

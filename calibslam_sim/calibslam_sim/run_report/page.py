@@ -6,11 +6,13 @@ from collections.abc import Callable, Sequence
 from html import escape
 from typing import Any
 
+import numpy as np
 import plotly.graph_objects as go
 from plotly.offline import get_plotlyjs
 
 from calibslam_sim.run_report import boxes, image_view, space, trajectories
 from calibslam_sim.run_report.loading import Run
+from calibslam_sim.run_report.sightings import Sightings
 from calibslam_sim.run_report.template import SCRIPT, STYLE
 
 HOW_TO_READ = (
@@ -117,16 +119,25 @@ def _of_run(parts: _Parts, run: Run) -> None:
     parts.figure(
         "Reliability of boxes, measured at this run's map",
         "Errors against the projected quadrics, which were fitted to these very boxes. Below the diagonal is "
-        "overconfident.",
+        f"overconfident. {_correlation(seen)}",
         boxes.reliability_of_boxes(seen),
     )
     true = boxes.sightings_of_truth(run)
     if true is not None:
         parts.figure(
             "Reliability of boxes, measured at the true objects",
-            "Errors against the true objects seen from the true poses.",
+            f"Errors against the true objects seen from the true poses. {_correlation(true)}",
             boxes.reliability_of_boxes(true),
         )
+
+
+def _correlation(seen: Sightings) -> str:
+    found = seen.neighbour_correlation()
+    if np.isnan(found):
+        return ""
+    return (
+        f"Errors of an object's boxes in neighbouring keyframes correlate by {found:.2f}; the graph takes that for 0."
+    )
 
 
 def metrics_table(runs: Sequence[Run]) -> str:

@@ -20,6 +20,8 @@ from calibslam_backend.tracking import overlap
 from calibslam_msgs_py.measurements import Array, Boxes, Camera
 
 MIN_OVERLAP = 0.3  # intersection over union below which a box does not show a quadric
+LARGEST_RESIDUAL = 5.0  # that enters a correlation: it should not hang on a few gross errors
+FEWEST_PAIRS = 100  # of edges, for a correlation
 MIN_BOXES = 5  # an object with fewer has no spread to speak of
 
 
@@ -56,6 +58,23 @@ class Sightings:
         counts = {int(n): int(c) for n, c in zip(*np.unique(self.quadric, return_counts=True), strict=True)}
         sigma = dict(zip(self.quadric.tolist(), self.heuristic().tolist(), strict=True))
         return sorted((n for n, count in counts.items() if count >= MIN_BOXES), key=lambda n: -sigma[n])
+
+    def neighbour_correlation(self) -> float:
+        """Correlation of the errors of a box and of the next image's of the same object, in units of their deviations;
+        NaN where there are too few.
+
+        A factor graph takes it for zero. Where it is not, n boxes say less than n independent ones would.
+        """
+        z = self.errors / np.sqrt(np.diagonal(self.covariances, axis1=1, axis2=2))
+        z = np.clip(z, -LARGEST_RESIDUAL, LARGEST_RESIDUAL)
+        order = np.lexsort((self.image, self.quadric))
+        first, second = order[:-1], order[1:]
+        together = (self.quadric[first] == self.quadric[second]) & (self.image[second] == self.image[first] + 1)
+        a, b = z[first[together]].ravel(), z[second[together]].ravel()
+        known = ~(np.isnan(a) | np.isnan(b))
+        if np.count_nonzero(known) < FEWEST_PAIRS:
+            return float("nan")
+        return float(np.corrcoef(a[known], b[known])[0, 1])
 
     def _of_objects(self, values: dict[int, float]) -> Array:
         return np.array([values[n] for n in self.quadric.tolist()])
