@@ -77,7 +77,7 @@ def _body(quadric: QuadricEstimate, has_legend: bool) -> go.Mesh3d:
     """An ellipsoid; those of a class share a name in the legend."""
     unit, triangles = unit_sphere()
     points = quadric.T_map_object[:3, 3] + (unit * quadric.radii) @ quadric.T_map_object[:3, :3].T
-    i, j, k = triangles.T.astype(np.int32)
+    i, j, k = triangles.T.astype(np.int16)
     return go.Mesh3d(
         **_xyz(points), i=i, j=j, k=k, color=COLOURS[sum(map(ord, quadric.class_id)) % len(COLOURS)], opacity=0.45,
         name=quadric.class_id, legendgroup=quadric.class_id, showlegend=has_legend, hovertext=_text(quadric),

@@ -31,6 +31,7 @@ from calibslam_sim.run_report.style import (
 )
 
 MOST_ELLIPSES = 40  # of positions along a trajectory
+MOST_POINTS = 1500  # of the ground truth, which may be known more often than a line needs
 
 
 def from_above(run: Run) -> go.Figure:
@@ -72,7 +73,8 @@ def true_path(run: Run) -> Array | None:
         return None
     truth = run.recorded.truth
     inside = (truth.stamps >= run.map.stamps[0]) & (truth.stamps <= run.map.stamps[-1])
-    return np.asarray((T_map_world @ truth.poses[inside])[:, :3, 3])
+    positions = (T_map_world @ truth.poses[inside])[:, :3, 3]
+    return np.asarray(positions[:: -(-len(positions) // MOST_POINTS)])
 
 
 def errors_by_axis(run: Run) -> go.Figure | None:
