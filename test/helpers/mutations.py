@@ -57,8 +57,15 @@ def spoilt_message(message: Any, random: Random, lengths_too: bool) -> Any:
     spoilt = copy.deepcopy(message)
     for _ in range(random.randint(1, MOST_SPOILT)):
         owner, name = random.choice(leaves(spoilt))
-        setattr(owner, name, _spoilt(getattr(owner, name), random, lengths_too))
+        value = _spoilt(getattr(owner, name), random, lengths_too)
+        setattr(owner, name, value % 256 if _is_octet(owner, name) else value)
     return spoilt
+
+
+def _is_octet(message: Any, name: str) -> bool:
+    """Whether a field is one octet: rclpy, told to check fields, gives it nothing larger."""
+    types = getattr(message, "get_fields_and_field_types", dict)()
+    return types.get(name) in ("uint8", "octet")
 
 
 def _spoilt(value: Any, random: Random, lengths_too: bool) -> Any:
@@ -80,7 +87,7 @@ def _spoilt(value: Any, random: Random, lengths_too: bool) -> Any:
 
 
 def _integer(value: int, random: Random) -> int:
-    """One that every integer field of our messages can hold, except octets (which are arrays)."""
+    """One that every integer field of our messages can hold, except octets."""
     return random.choice((0, 1, value + 1 if value < 100_000 else value, 2**16, 999_999_999, 2**31 - 1))
 
 
