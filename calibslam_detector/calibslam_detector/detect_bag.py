@@ -19,7 +19,7 @@ import numpy as np
 from tqdm import tqdm
 
 from calibslam_detector.detector import Detector, DetectorSettings, DeviceError
-from calibslam_detector.image_conversion import OVERLAY_QUALITY, decode_compressed, decode_raw, encode_jpeg
+from calibslam_detector.image_conversion import OVERLAY_QUALITY, decode_image, encode_jpeg
 from calibslam_detector.overlay import draw_overlay
 from calibslam_detector.weights_file import SHIPPED, WeightsError
 from calibslam_msgs_py import bags
@@ -86,7 +86,7 @@ def detect_bag(bag: Path, out: Path, detector: Detector, settings: DetectBagSett
                     continue
                 progress.update()
                 try:
-                    image = _decode(content)
+                    image = decode_image(content)
                 except InvalidMeasurement as error:
                     left_out[f"image: {error.reason}"] += 1
                     continue
@@ -139,18 +139,6 @@ def _copied_topics(
 def _marked(messages: Iterator[tuple[str, int, Any]]) -> Iterator[tuple[str, int, Any]]:
     """Images to detect on, told from what is copied by an empty name."""
     return (("", time, message) for _, time, message in messages)
-
-
-def _decode(message: Any) -> np.ndarray:
-    """(H, W, 3) RGB of a sensor_msgs/Image or CompressedImage.
-
-    Raises:
-        InvalidMeasurement: it cannot be decoded.
-    """
-    data = np.frombuffer(message.data, np.uint8)
-    if hasattr(message, "encoding"):
-        return decode_raw(data, message.height, message.width, message.step, message.encoding)
-    return decode_compressed(data)
 
 
 def _overlay(image: np.ndarray, boxes: Boxes) -> Any:

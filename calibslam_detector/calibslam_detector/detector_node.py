@@ -7,11 +7,11 @@ it is their turn are counted as dropped: a late box is worth less than a new one
 from __future__ import annotations
 
 import sys
-import threading
 import time
 from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -21,16 +21,15 @@ from rclpy.node import Node
 from sensor_msgs.msg import CompressedImage, Image
 
 from calibslam_detector.detector import Detector, DetectorSettings, DeviceError
-from calibslam_detector.image_conversion import OVERLAY_QUALITY, decode_compressed, decode_raw, encode_jpeg
+from calibslam_detector.image_conversion import OVERLAY_QUALITY, decode_image, encode_jpeg
 from calibslam_detector.overlay import draw_overlay
 from calibslam_detector.weights_file import SHIPPED, WeightsError
 from calibslam_msgs_py.conversions import RosTypes, boxes_to_msg, header_to_msg, stamp_from_msg, valid_boxes
-from calibslam_msgs_py.measurements import InvalidMeasurement
 from calibslam_msgs_py.node import MEASUREMENT, SENSOR, Counters, run
 from calibslam_msgs_py.node_sensors import SensorSubscription
+from calibslam_msgs_py.node_worker import SECONDS_BETWEEN_WARNINGS, NewestWorker
 from calibslam_msgs_py.settings import Settings, SettingsError, declare_parameters, setting
 
-SECONDS_BETWEEN_WARNINGS = 5.0
 # Of images like those learnt from, 5 % are strange; of 20 independent ones more than half once in 10^9 times.
 STRANGE_WINDOW, STRANGE_SHARE = 20, 0.5
 
@@ -69,55 +68,21 @@ class DetectorNode(Node):
         self._counters.set("device", self._detector.device)
         self._boxes = self.create_publisher(BoundingBoxArray, "detections", MEASUREMENT)
         self._overlay = self.create_publisher(CompressedImage, "~/overlay/compressed", SENSOR)
-        self._newest: Waiting | None = None
-        self._arrived = threading.Condition()
-        self._stop = False
         self._strange: deque[bool] = deque(maxlen=STRANGE_WINDOW)
-        self._worker = threading.Thread(target=self._work, name="detector", daemon=True)
-        self._worker.start()
+        self._worker = NewestWorker(self, self._counters, self._detect)
         self._images = [
-            SensorSubscription(self, Image, "camera/image_raw", self._receive_raw),
-            SensorSubscription(self, CompressedImage, "camera/image_raw/compressed", self._receive_compressed),
+            SensorSubscription(self, Image, "camera/image_raw", self._receive),
+            SensorSubscription(self, CompressedImage, "camera/image_raw/compressed", self._receive),
         ]
         self.get_logger().info(f"detecting {', '.join(self._detector.class_names)} on {self._detector.device}")
 
     # -- executor's thread --------------------------------------------------------------------------------------
 
-    def _receive_raw(self, message: Any) -> None:
-        self._put(
-            message.header,
-            lambda: decode_raw(
-                np.frombuffer(message.data, np.uint8), message.height, message.width, message.step, message.encoding
-            ),
-        )
-
-    def _receive_compressed(self, message: Any) -> None:
-        self._put(message.header, lambda: decode_compressed(np.frombuffer(message.data, np.uint8)))
-
-    def _put(self, header: Any, decode: Callable[[], np.ndarray]) -> None:
-        with self._arrived:
-            if self._newest is not None:
-                self._counters.count("dropped")
-            self._newest = Waiting(decode, stamp_from_msg(header.stamp), str(header.frame_id))
-            self._arrived.notify()
+    def _receive(self, message: Any) -> None:
+        header = message.header
+        self._worker.put(Waiting(partial(decode_image, message), stamp_from_msg(header.stamp), str(header.frame_id)))
 
     # -- worker's thread ----------------------------------------------------------------------------------------
-
-    def _work(self) -> None:
-        while True:
-            with self._arrived:
-                self._arrived.wait_for(lambda: self._newest is not None or self._stop)
-                waiting, self._newest = self._newest, None
-            if self._stop or waiting is None:
-                return
-            try:
-                self._detect(waiting)
-            except InvalidMeasurement as error:
-                self._counters.count(f"rejected_{error.reason}")
-                self.get_logger().warning(f"left out: {error}", throttle_duration_sec=SECONDS_BETWEEN_WARNINGS)
-            except Exception as error:  # the node goes on with the next image
-                self._counters.count("errors")
-                self.get_logger().error(f"{type(error).__name__}: {error}")
 
     def _detect(self, waiting: Waiting) -> None:
         start = time.monotonic()
@@ -151,10 +116,7 @@ class DetectorNode(Node):
 
     def close(self) -> None:
         """Let the worker end its image."""
-        with self._arrived:
-            self._stop = True
-            self._arrived.notify()
-        self._worker.join(timeout=10.0)
+        self._worker.close()
 
 
 def main(args: Sequence[str] | None = None) -> int:

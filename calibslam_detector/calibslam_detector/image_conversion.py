@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import cv2
 import numpy as np
 
@@ -118,3 +120,15 @@ def encode_jpeg(image: np.ndarray, quality: int) -> bytes:
     if not done:
         raise RuntimeError("OpenCV cannot encode JPEG")
     return bytes(data)
+
+
+def decode_image(message: Any) -> np.ndarray:
+    """(H, W, 3) RGB of a sensor_msgs/Image or CompressedImage, of rclpy or of a bag.
+
+    Raises:
+        InvalidMeasurement: it cannot be decoded.
+    """
+    data = np.frombuffer(message.data, np.uint8)
+    if hasattr(message, "encoding"):
+        return decode_raw(data, message.height, message.width, message.step, message.encoding)
+    return decode_compressed(data)

@@ -5,11 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 
 import cv2
-import numpy as np
 
 from calibslam_detector.detect_bag import DetectBagSettings, detect_bag
 from calibslam_detector.detector import Detector, DetectorSettings
-from calibslam_detector.image_conversion import decode_compressed
+from calibslam_detector.image_conversion import decode_image
 from calibslam_detector.overlay import draw_overlay
 from calibslam_detector.weights_file import SHIPPED
 from calibslam_msgs_py.bags import BagReader
@@ -51,6 +50,6 @@ def write_overlay(bag: Path, detected: Path, file: Path) -> None:
     with BagReader(bag) as reader:
         for _, _, message in reader.messages([topics.IMAGE]):
             if stamp_from_msg(message.header.stamp) == best.stamp:
-                image = decode_compressed(np.frombuffer(message.data, np.uint8))
+                image = decode_image(message)
                 cv2.imwrite(str(file), draw_overlay(image[..., ::-1], best))
                 return

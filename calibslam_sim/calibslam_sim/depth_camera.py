@@ -9,7 +9,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from calibslam_detector.image_conversion import decode_compressed, decode_compressed_depth, decode_depth, decode_raw
+from calibslam_detector.image_conversion import decode_compressed_depth, decode_depth, decode_image
 from calibslam_msgs_py.conversions import stamp_from_msg
 from calibslam_msgs_py.measurements import Camera, InvalidMeasurement
 from calibslam_msgs_py.settings import Settings, setting
@@ -81,12 +81,7 @@ class DepthCamera:
 
 
 def _grey(message: Any) -> np.ndarray:
-    data = np.frombuffer(message.data, np.uint8)
-    if hasattr(message, "format"):
-        rgb = decode_compressed(data)
-    else:
-        rgb = decode_raw(data, message.height, message.width, message.step, message.encoding)
-    return np.asarray(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY))
+    return np.asarray(cv2.cvtColor(decode_image(message), cv2.COLOR_RGB2GRAY))
 
 
 def _depth(message: Any) -> np.ndarray:

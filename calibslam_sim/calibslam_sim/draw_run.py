@@ -16,7 +16,7 @@ import numpy as np
 
 from calibslam_backend.object_map import MapFileError, ObjectMap
 from calibslam_backend.recording import Recording
-from calibslam_detector.image_conversion import decode_compressed, decode_raw, encode_jpeg
+from calibslam_detector.image_conversion import decode_image, encode_jpeg
 from calibslam_detector.overlay import class_colour, draw_overlay
 from calibslam_msgs_py.bags import BagError, BagReader
 from calibslam_msgs_py.conversions import stamp_from_msg
@@ -91,12 +91,8 @@ def draw_run(run: Path, bag_path: Path, out: Path) -> int:
                 stamp = stamp_from_msg(message.header.stamp)
                 if stamp not in poses:
                     continue
-                data = np.frombuffer(message.data, np.uint8)
                 try:
-                    if hasattr(message, "format"):
-                        rgb = decode_compressed(data)
-                    else:
-                        rgb = decode_raw(data, message.height, message.width, message.step, message.encoding)
+                    rgb = decode_image(message)
                 except InvalidMeasurement as error:
                     print(f"left out: {error}", file=sys.stderr)
                     continue

@@ -12,11 +12,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from calibslam_backend.object_map import MapFileError, ObjectMap
 from calibslam_backend.recording import CAMERA
-from calibslam_detector.image_conversion import decode_compressed, decode_raw
+from calibslam_detector.image_conversion import decode_image
 from calibslam_detector.overlay import class_colour
 from calibslam_msgs_py.bags import BagError, BagReader
 from calibslam_msgs_py.conversions import camera_from_msg, stamp_from_msg
@@ -76,17 +74,13 @@ def _log_images(rerun: Any, path: Path) -> None:
         wanted = [name for name in (CAMERA, topics.IMAGE, topics.RAW_IMAGE) if name in bag.topics]
         for topic, _, message in bag.messages(wanted):
             rerun.set_time("time", timestamp=stamp_from_msg(message.header.stamp) / SECOND)
-            data = np.frombuffer(message.data, np.uint8) if topic != CAMERA else np.empty(0, np.uint8)
             try:
                 if topic == CAMERA:
                     camera = camera_from_msg(message)
                     pinhole = rerun.Pinhole(image_from_camera=camera.K, resolution=[camera.width, camera.height])
                     rerun.log("map/camera", pinhole)
-                elif topic == topics.IMAGE:
-                    rerun.log("map/camera/image", rerun.Image(decode_compressed(data)).compress())
                 else:
-                    rgb = decode_raw(data, message.height, message.width, message.step, message.encoding)
-                    rerun.log("map/camera/image", rerun.Image(rgb).compress())
+                    rerun.log("map/camera/image", rerun.Image(decode_image(message)).compress())
             except InvalidMeasurement as error:
                 print(f"left out: {error}", file=sys.stderr)
 

@@ -7,7 +7,6 @@ others are counted as dropped: the next motion spans them.
 from __future__ import annotations
 
 import sys
-import threading
 import time
 from collections.abc import Sequence
 from typing import Any
@@ -20,12 +19,11 @@ from calibslam_msgs_py.conversions import RosTypes, camera_from_msg, motion_to_m
 from calibslam_msgs_py.measurements import InvalidMeasurement
 from calibslam_msgs_py.node import MEASUREMENT, SENSOR, Counters, run
 from calibslam_msgs_py.node_sensors import SensorSubscription
+from calibslam_msgs_py.node_worker import SECONDS_BETWEEN_WARNINGS, NewestWorker
 from calibslam_msgs_py.settings import declare_parameters
 from calibslam_sim.depth_camera import DepthCamera, DepthCameraSettings
 from calibslam_sim.image_pairs import Pair
 from calibslam_sim.visual_odometry import VisualOdometrySettings
-
-SECONDS_BETWEEN_WARNINGS = 5.0
 
 
 class VisualOdometryNode(Node):
@@ -38,11 +36,7 @@ class VisualOdometryNode(Node):
         self._types = RosTypes()
         self._counters = Counters(self)
         self._publisher = self.create_publisher(RelativePose, "relative_pose", MEASUREMENT)
-        self._newest: Pair[Any, Any] | None = None
-        self._arrived = threading.Condition()
-        self._stop = False
-        self._worker = threading.Thread(target=self._work, name="visual odometry", daemon=True)
-        self._worker.start()
+        self._worker = NewestWorker(self, self._counters, self._follow)
         self.create_subscription(CameraInfo, "camera/camera_info", self._receive_camera, SENSOR)
         self._images = [
             SensorSubscription(self, kind, topic, receive)
@@ -60,7 +54,7 @@ class VisualOdometryNode(Node):
         try:
             self._camera.set_camera(camera_from_msg(message))
         except InvalidMeasurement as error:
-            self._reject(error)
+            self._worker.reject(error)
 
     def _receive_image(self, message: Any) -> None:
         self._put(self._camera.add_image(message))
@@ -73,28 +67,9 @@ class VisualOdometryNode(Node):
             self._counters.count(f"rejected_{reason}", count)
         self._camera.rejected.clear()
         for pair in pairs:
-            with self._arrived:
-                if self._newest is not None:
-                    self._counters.count("dropped")
-                self._newest = pair
-                self._arrived.notify()
+            self._worker.put(pair)
 
     # -- worker's thread ----------------------------------------------------------------------------------------
-
-    def _work(self) -> None:
-        while True:
-            with self._arrived:
-                self._arrived.wait_for(lambda: self._newest is not None or self._stop)
-                pair, self._newest = self._newest, None
-            if self._stop or pair is None:
-                return
-            try:
-                self._follow(pair)
-            except InvalidMeasurement as error:
-                self._reject(error)
-            except Exception as error:  # the node goes on with the next image
-                self._counters.count("errors")
-                self.get_logger().error(f"{type(error).__name__}: {error}")
 
     def _follow(self, pair: Pair[Any, Any]) -> None:
         began = time.monotonic()
@@ -114,16 +89,9 @@ class VisualOdometryNode(Node):
                 throttle_duration_sec=SECONDS_BETWEEN_WARNINGS,
             )
 
-    def _reject(self, error: InvalidMeasurement) -> None:
-        self._counters.count(f"rejected_{error.reason}")
-        self.get_logger().warning(f"left out: {error}", throttle_duration_sec=SECONDS_BETWEEN_WARNINGS)
-
     def close(self) -> None:
         """Let the worker end its image."""
-        with self._arrived:
-            self._stop = True
-            self._arrived.notify()
-        self._worker.join(timeout=10.0)
+        self._worker.close()
 
 
 def main(args: Sequence[str] | None = None) -> int:

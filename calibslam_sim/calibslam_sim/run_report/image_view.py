@@ -9,7 +9,7 @@ from html import escape
 import cv2
 import numpy as np
 
-from calibslam_detector.image_conversion import decode_compressed, decode_raw, encode_jpeg
+from calibslam_detector.image_conversion import decode_image, encode_jpeg
 from calibslam_detector.overlay import ellipse_axes
 from calibslam_msgs_py.bags import BagReader
 from calibslam_msgs_py.conversions import stamp_from_msg
@@ -21,7 +21,6 @@ from calibslam_sim.run_report.style import SIGMAS
 
 IMAGES = 4  # that are shown of a run
 QUALITY = 80  # of their JPEG
-RAW_IMAGE = topics.IMAGE.removesuffix("/compressed")
 
 
 def views(run: Run, seen: Sightings) -> list[str]:
@@ -40,17 +39,13 @@ def _pictures(recorded: Recorded, stamps: set[int]) -> dict[int, np.ndarray]:
     """Images (H, W, 3) RGB of these times, undistorted, where the recording has them."""
     found: dict[int, np.ndarray] = {}
     with BagReader(recorded.path) as bag:
-        named = [topic for topic in (topics.IMAGE, RAW_IMAGE) if topic in bag.topics][:1]
-        for topic, _, message in bag.messages(named):
+        named = [topic for topic in (topics.IMAGE, topics.RAW_IMAGE) if topic in bag.topics][:1]
+        for _, _, message in bag.messages(named):
             stamp = stamp_from_msg(message.header.stamp)
             if stamp not in stamps:
                 continue
-            data = np.frombuffer(message.data, np.uint8)
             try:
-                if topic == topics.IMAGE:
-                    image = decode_compressed(data)
-                else:
-                    image = decode_raw(data, message.height, message.width, message.step, message.encoding)
+                image = decode_image(message)
             except InvalidMeasurement:
                 continue  # the view is then drawn without it
             found[stamp] = cv2.undistort(image, recorded.camera.K, recorded.camera.distortion)
