@@ -27,8 +27,8 @@ def test_as_reliable_as_the_publisher(reliability: ReliabilityPolicy) -> None:
         publisher = publishing.node.create_publisher(Image, "images", profile)
 
         def matched() -> bool:
-            (info,) = subscriber.node.get_subscriptions_info_by_topic("/images") or [None]
-            return info is not None and info.qos_profile.reliability == reliability
+            found = subscriber.node.get_subscriptions_info_by_topic("/images")
+            return [info.qos_profile.reliability for info in found] == [reliability]
 
         wait_until(lambda: matched() and publisher.get_subscription_count() == 1, "they do not connect")
         time.sleep(1.0)  # that one side has found the other does not tell that the other has

@@ -18,12 +18,13 @@ from rclpy.node import Node
 from calibslam_backend.diagnostics import of_session
 from calibslam_backend.estimator import EstimatorSettings
 from calibslam_backend.event_messages_node import TYPES, Decoder
-from calibslam_backend.intake import Event, Kind
+from calibslam_backend.intake import Kind
 from calibslam_backend.journal import Journal, JournalError
 from calibslam_backend.kernels import load_kernels
+from calibslam_backend.map_publisher_node import MapPublisher
 from calibslam_backend.map_services_node import MapServices
 from calibslam_backend.map_to_odom_node import MapToOdom
-from calibslam_backend.published import POSE, TOPICS, map_messages, pose_message
+from calibslam_backend.published import POSE, TOPICS, pose_message
 from calibslam_backend.session import NotReady, Session
 from calibslam_backend.session_settings import SessionSettings
 from calibslam_backend.transform import transform_from_text
@@ -42,6 +43,7 @@ from calibslam_msgs_py.node import (
 from calibslam_msgs_py.settings import SettingsError, declare_parameters, setting
 
 SECONDS_TO_SAVE = 3.0  # at the end, for measurements that still wait
+BEHIND_STAMP = 12  # [bytes] of a serialised message with a header: what kind of CDR it is, seconds, nanoseconds
 
 
 @dataclass(frozen=True)
@@ -74,17 +76,16 @@ class BackendNode(Node):
             raise SettingsError(f"camera_in_body: {error}") from None
         self._types = RosTypes()
         self._counters = Counters(self, lambda: of_session(self._session))
-        self._map_publishers = {
-            topic: advertise(self, self._types(kind), topic, LATCHED) for topic, kind in TOPICS.items()
-        }
+        self._outputs = {topic: advertise(self, self._types(kind), topic, LATCHED) for topic, kind in TOPICS.items()}
+        self._map = MapPublisher(self._outputs, self._types, settings.map_frame, settings.map_period)
         self._map_to_odom = MapToOdom(self, settings.map_frame)
         load_kernels()  # before anything can come in and wait
         self._session = Session(T_body_camera, settings, estimator_settings, self, journal)
         self._decoder = Decoder(settings.map_frame, self)
+        self._camera_data = b""  # the last one that was taken
         if journal is not None:
             self._introduce(journal)
         self._stop = threading.Event()
-        self._published = 0.0
         self._worker = threading.Thread(target=self._work, name="estimator", daemon=True)
         self._worker.start()
         for kind, topic, profile in (
@@ -129,11 +130,12 @@ class BackendNode(Node):
         name = topic.rpartition("/")[2]
 
         def receive(data: bytes) -> None:
+            arrived = time.monotonic()
             try:
-                event = self._decoder.event(kind, data, time.monotonic())
                 if kind == Kind.CAMERA:
-                    self._take_camera(event)
+                    self._take_camera(data, arrived)
                     return
+                event = self._decoder.event(kind, data, arrived)
                 if isinstance(event.content, Boxes):
                     self._counters.arrived(name, event.content.stamp)
                 elif isinstance(event.content, RelativeMotion):
@@ -144,9 +146,12 @@ class BackendNode(Node):
 
         return receive
 
-    def _take_camera(self, event: Event) -> None:
-        before = self._session.camera
-        self._session.offer_camera(event)
+    def _take_camera(self, data: bytes, arrived: float) -> None:
+        if data[BEHIND_STAMP:] == self._camera_data:  # with each image the same
+            return
+        before, self._camera_data = self._session.camera, b""
+        self._session.offer_camera(self._decoder.event(Kind.CAMERA, data, arrived))
+        self._camera_data = data[BEHIND_STAMP:]
         if before is None and (camera := self._session.camera) is not None:
             self.get_logger().info(f"camera {camera.frame_id}: {camera.width} x {camera.height} pixels")
 
@@ -157,30 +162,24 @@ class BackendNode(Node):
             if self._stop.is_set():
                 return
         while not self._stop.is_set():
-            self._session.step(timeout=0.05)
-            with self._session.lock:
-                try:
-                    self._publish()
-                except Exception as error:  # an estimate that cannot be used for now
-                    self.count("errors")
-                    self.say(f"publishing: {type(error).__name__}: {error}")
+            try:
+                if not self._map.publish_some(self._session):
+                    self._session.step(timeout=0.05)
+                    self._publish_pose()
+            except Exception as error:  # an estimate that cannot be used for now
+                self.count("errors")
+                self.say(f"publishing: {type(error).__name__}: {error}")
 
-    def _publish(self) -> None:
-        """What has changed: each pose, and maps now and then."""
+    def _publish_pose(self) -> None:
+        """As soon as there is a new one; the map has time."""
         session = self._session
-        estimator = session.estimator
-        if estimator is None or not estimator.stamps:
-            return
-        if session.pose_is_new:
+        with session.lock:
+            estimator = session.estimator
+            if estimator is None or not estimator.stamps or not session.pose_is_new:
+                return
             session.pose_is_new = False
-            self._map_publishers[POSE].publish(pose_message(estimator, self._types, self._settings.map_frame))
+            self._outputs[POSE].publish(pose_message(estimator, self._types, self._settings.map_frame))
             self._map_to_odom.publish(estimator.stamps[-1], estimator.body_pose())
-        now = time.monotonic()
-        period = self._settings.map_period * (2.0 if len(session.intake) else 1.0)
-        if session.map_is_new and (session.refined or now - self._published >= period):
-            session.map_is_new, self._published = False, now
-            for topic, message in map_messages(estimator, self._types, self._settings.map_frame):
-                self._map_publishers[topic].publish(message)
 
     def close(self) -> None:
         """Let the worker end its update, save the map if that is wanted, and have the journal on disk."""

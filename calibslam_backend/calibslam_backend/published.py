@@ -49,11 +49,10 @@ def camera_transform_message(estimator: Estimator, camera_frame: str, types: Mes
 
 
 def map_messages(estimator: Estimator, types: MessageTypes, frame: str = MAP) -> Iterator[tuple[str, Any]]:
-    """Trajectory, quadrics and their markers, as (topic, message)."""
-    stamp = estimator.stamps[-1]
+    """Trajectory, quadrics and their markers, as (topic, message); each as things are when it is asked for."""
     poses = [StampedPose(t, T) for t, T in zip(estimator.stamps, estimator.trajectory(), strict=True)]
-    quadrics = estimator.quadrics()
     yield TRAJECTORY, path_to_msg(poses, frame, types)
+    stamp, quadrics = estimator.stamps[-1], estimator.quadrics()
     yield QUADRICS, quadrics_to_msg(stamp, quadrics, types, frame)
     yield MARKERS, markers_message(stamp, quadrics, types, frame)
 

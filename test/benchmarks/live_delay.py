@@ -48,9 +48,13 @@ def main() -> int:
         time.sleep(2.0)  # the last diagnostics
         counts = watcher.counts("/backend")
         process.end()
-    delays = [1e3 * (at - player.published[stamp]) for stamp, at in received.items() if stamp in player.published]
+    delays = {
+        stamp: 1e3 * (at - player.published[stamp]) for stamp, at in received.items() if stamp in player.published
+    }
     print(f"{len(delays)} poses in {wall:.0f} s, load of the machine {os.getloadavg()[0]:.1f}")
-    print(f"from boxes to pose [ms]: {quantiles(delays)}")
+    print(f"from boxes to pose [ms]: {quantiles(list(delays.values()))}")
+    at_once = [delay for stamp, delay in delays.items() if stamp in player.known]
+    print(f"the {len(at_once)} of them whose odometry was there: {quantiles(at_once)}")
     inside = {key: counts.get(key) for key in ("delay_ms_p50", "delay_ms_p99", "update_ms_p50", "update_ms_p99")}
     print(f"inside the node: {inside}")
     print(f"share of one core: {cpu / wall:.0%}")

@@ -63,6 +63,7 @@ class Player:
     Attributes:
         share: of the measurements that have been published.
         published: when each image was (monotonic [s]), by its stamp [ns].
+        known: stamps [ns] of the images whose odometry was published before.
     """
 
     def __init__(self, watcher: Watcher, camera: Camera) -> None:
@@ -73,13 +74,14 @@ class Player:
         self._motions = node.create_publisher(RelativePose, "relative_pose", KEPT)
         self.share = 0.0
         self.published: dict[int, float] = {}
+        self.known: set[int] = set()
 
     def play(self, measurements: list[Boxes | RelativeMotion], rate: float) -> None:
         messages = [
             (time_of(m), boxes_to_msg(m, TYPES) if isinstance(m, Boxes) else motion_to_msg(m, TYPES))
             for m in measurements
         ]
-        begin, first = time.monotonic(), messages[0][0]
+        begin, first, odometry = time.monotonic(), messages[0][0], -1
         for n, (stamp, message) in enumerate(messages, start=1):
             due = begin + (stamp - first) / SECOND / rate
             if (rest := due - time.monotonic()) > 0.0:
@@ -87,9 +89,12 @@ class Player:
             if isinstance(message, BoundingBoxArray):
                 self._camera.publish(self._camera_message)
                 self.published[stamp] = time.monotonic()
+                if stamp <= odometry:
+                    self.known.add(stamp)
                 self._boxes.publish(message)
             else:
                 self._motions.publish(message)
+                odometry = stamp
             self.share = n / len(messages)
 
 

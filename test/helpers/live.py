@@ -18,12 +18,11 @@ import numpy as np
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
 from nav_msgs.msg import Path as PathMessage
-from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 
 from calibslam_backend.metrics import Trajectory
 from calibslam_msgs_py.conversions import pose_from_msg, stamp_from_msg
-from calibslam_msgs_py.node import LATCHED
+from calibslam_msgs_py.node import LATCHED, make_executor
 
 PATIENCE = 120.0  # [s] for what takes a second on an idle machine
 
@@ -110,7 +109,7 @@ class Watcher:
         self._context = rclpy.Context()
         rclpy.init(context=self._context, domain_id=domain)
         self.node = Node("watcher", context=self._context)
-        self._executor = SingleThreadedExecutor(context=self._context)
+        self._executor = make_executor(self._context)
         self._executor.add_node(self.node)
         self._thread = threading.Thread(target=self._spin, daemon=True)
         self._stop = threading.Event()
