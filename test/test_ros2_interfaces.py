@@ -232,3 +232,21 @@ def test_bad_parameter_files_are_refused(line: str, said: str, tmp_path: Path) -
     with Process(random_domain(), "calibslam_backend", "backend", "--ros-args", "--params-file", str(file)) as process:
         assert process.wait() == 2, process.output
         assert "error: " in process.output and said in process.output and "Traceback" not in process.output
+
+
+@pytest.mark.parametrize(
+    ("name", "outputs"),
+    {
+        "backend": list(TOPICS),
+        "calibrator": ["/detections"],
+        "detector": ["/detections", "/detector/overlay/compressed"],
+        "odometry": ["/relative_pose"],
+        "visual_odometry": ["/relative_pose"],
+    }.items(),
+)
+def test_qos_overrides(name: str, outputs: list[str], graph: Watcher) -> None:
+    """Every output's quality of service is a parameter."""
+    names = graph.call(ListParameters, f"/{name}/list_parameters").result.names
+    for output in outputs:
+        for policy in ("depth", "durability", "history", "reliability"):
+            assert f"qos_overrides.{output}.publisher.{policy}" in names

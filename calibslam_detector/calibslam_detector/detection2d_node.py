@@ -17,10 +17,9 @@ from sensor_msgs.msg import CameraInfo
 from calibslam_msgs_py.conversions import RosTypes, boxes_to_msg, camera_from_msg, valid_boxes
 from calibslam_msgs_py.detection_conversions import DETECTIONS_2D, boxes_from_detections_2d
 from calibslam_msgs_py.measurements import Camera, InvalidMeasurement
-from calibslam_msgs_py.node import MEASUREMENT, SENSOR, Counters, run
+from calibslam_msgs_py.node import MEASUREMENT, SENSOR, Counters, advertise, run, subscribe
 from calibslam_msgs_py.settings import SettingsError
 
-SECONDS_BETWEEN_WARNINGS = 5.0
 # Best effort, so that it connects to detectors of either kind; deep, so that none gets lost here.
 FOREIGN_INPUT = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=100, reliability=ReliabilityPolicy.BEST_EFFORT)
 
@@ -39,35 +38,32 @@ class Detection2DNode(Node):
             ) from None
         self._camera: Camera | None = None
         self._counters = Counters(self)
-        self._publisher = self.create_publisher(BoundingBoxArray, "detections_raw", MEASUREMENT)
-        self.create_subscription(CameraInfo, "camera/camera_info", self._receive_camera, SENSOR)
-        self.create_subscription(kind, "detections_2d", self._receive, FOREIGN_INPUT)
+        self._publisher = advertise(self, BoundingBoxArray, "detections_raw", MEASUREMENT)
+        subscribe(self, self._counters, CameraInfo, "camera/camera_info", self._receive_camera, SENSOR)
+        subscribe(self, self._counters, kind, "detections_2d", self._receive, FOREIGN_INPUT)
 
     def _receive_camera(self, message: Any) -> None:
         try:
             self._camera = camera_from_msg(message)
         except InvalidMeasurement as error:
-            self._reject(error.reason, 1, str(error))
+            self._counters.reject(error)
 
     def _receive(self, message: Any) -> None:
         if self._camera is None:
-            self._reject("no_camera", 1, "boxes came before camera_info, which tells the image's size")
+            error = InvalidMeasurement("no_camera", "boxes came before camera_info, which tells the image's size")
+            self._counters.reject(error)
             return
         try:
             found, left_out = boxes_from_detections_2d(message, self._camera)
         except InvalidMeasurement as error:
-            self._reject(error.reason, 1, str(error))
+            self._counters.reject(error)
             return
         boxes, rejected = valid_boxes(found)
         for reason, count in {**left_out, **rejected}.items():
-            self._reject(f"box_{reason}", count, f"{count} boxes: {reason}")
+            self._counters.reject(InvalidMeasurement(f"box_{reason}", f"{count} boxes: {reason}"), count)
         self._publisher.publish(boxes_to_msg(boxes, self._types))
         self._counters.count("images")
         self._counters.count("boxes", len(boxes))
-
-    def _reject(self, reason: str, count: int, text: str) -> None:
-        self._counters.count(f"rejected_{reason}", count)
-        self.get_logger().warning(f"left out: {text}", throttle_duration_sec=SECONDS_BETWEEN_WARNINGS)
 
 
 def main(args: Sequence[str] | None = None) -> int:

@@ -25,9 +25,9 @@ from calibslam_detector.image_conversion import OVERLAY_QUALITY, decode_image, e
 from calibslam_detector.overlay import draw_overlay
 from calibslam_detector.weights_file import SHIPPED, WeightsError
 from calibslam_msgs_py.conversions import RosTypes, boxes_to_msg, header_to_msg, stamp_from_msg, valid_boxes
-from calibslam_msgs_py.node import MEASUREMENT, SENSOR, Counters, run
+from calibslam_msgs_py.node import MEASUREMENT, SECONDS_BETWEEN_WARNINGS, SENSOR, Counters, advertise, run
 from calibslam_msgs_py.node_sensors import SensorSubscription
-from calibslam_msgs_py.node_worker import SECONDS_BETWEEN_WARNINGS, NewestWorker
+from calibslam_msgs_py.node_worker import NewestWorker
 from calibslam_msgs_py.settings import Settings, SettingsError, declare_parameters, setting
 
 # Of images like those learnt from, 5 % are strange; of 20 independent ones more than half once in 10^9 times.
@@ -66,8 +66,8 @@ class DetectorNode(Node):
         self._types = RosTypes()
         self._counters = Counters(self)
         self._counters.set("device", self._detector.device)
-        self._boxes = self.create_publisher(BoundingBoxArray, "detections", MEASUREMENT)
-        self._overlay = self.create_publisher(CompressedImage, "~/overlay/compressed", SENSOR)
+        self._boxes = advertise(self, BoundingBoxArray, "detections", MEASUREMENT)
+        self._overlay = advertise(self, CompressedImage, "~/overlay/compressed", SENSOR)
         self._strange: deque[bool] = deque(maxlen=STRANGE_WINDOW)
         self._worker = NewestWorker(self, self._counters, self._detect)
         self._images = [

@@ -11,8 +11,6 @@ from rclpy.node import Node
 from calibslam_msgs_py.measurements import InvalidMeasurement
 from calibslam_msgs_py.node import Counters
 
-SECONDS_BETWEEN_WARNINGS = 5.0
-
 Item = TypeVar("Item")
 
 
@@ -43,11 +41,6 @@ class NewestWorker(Generic[Item]):
             self._newest = item
             self._arrived.notify()
 
-    def reject(self, error: InvalidMeasurement) -> None:
-        """Count and tell what cannot be used."""
-        self._counters.count(f"rejected_{error.reason}")
-        self._node.get_logger().warning(f"left out: {error}", throttle_duration_sec=SECONDS_BETWEEN_WARNINGS)
-
     def close(self) -> None:
         """Let the thread end what it has begun."""
         with self._arrived:
@@ -65,7 +58,7 @@ class NewestWorker(Generic[Item]):
             try:
                 self._work(item)
             except InvalidMeasurement as error:
-                self.reject(error)
+                self._counters.reject(error)
             except Exception as error:  # the node goes on with the next
                 self._counters.count("errors")
                 self._node.get_logger().error(f"{type(error).__name__}: {error}")

@@ -17,9 +17,9 @@ from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 
 from calibslam_msgs_py.conversions import RosTypes, camera_from_msg, motion_to_msg
 from calibslam_msgs_py.measurements import InvalidMeasurement
-from calibslam_msgs_py.node import MEASUREMENT, SENSOR, Counters, run
+from calibslam_msgs_py.node import MEASUREMENT, SECONDS_BETWEEN_WARNINGS, SENSOR, Counters, advertise, run, subscribe
 from calibslam_msgs_py.node_sensors import SensorSubscription
-from calibslam_msgs_py.node_worker import SECONDS_BETWEEN_WARNINGS, NewestWorker
+from calibslam_msgs_py.node_worker import NewestWorker
 from calibslam_msgs_py.settings import declare_parameters
 from calibslam_sim.depth_camera import DepthCamera, DepthCameraSettings
 from calibslam_sim.image_pairs import Pair
@@ -35,9 +35,9 @@ class VisualOdometryNode(Node):
         self._camera = DepthCamera(settings, declare_parameters(self, VisualOdometrySettings))
         self._types = RosTypes()
         self._counters = Counters(self)
-        self._publisher = self.create_publisher(RelativePose, "relative_pose", MEASUREMENT)
+        self._publisher = advertise(self, RelativePose, "relative_pose", MEASUREMENT)
         self._worker = NewestWorker(self, self._counters, self._follow)
-        self.create_subscription(CameraInfo, "camera/camera_info", self._receive_camera, SENSOR)
+        subscribe(self, self._counters, CameraInfo, "camera/camera_info", self._receive_camera, SENSOR)
         self._images = [
             SensorSubscription(self, kind, topic, receive)
             for kind, topic, receive in (
@@ -54,7 +54,7 @@ class VisualOdometryNode(Node):
         try:
             self._camera.set_camera(camera_from_msg(message))
         except InvalidMeasurement as error:
-            self._worker.reject(error)
+            self._counters.reject(error)
 
     def _receive_image(self, message: Any) -> None:
         self._put(self._camera.add_image(message))
