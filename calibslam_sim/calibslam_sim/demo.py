@@ -19,6 +19,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from calibslam_backend.kernels import load_kernels
 from calibslam_backend.object_map import ObjectMap
 from calibslam_msgs_py.bags import BagError, BagReader
 from calibslam_sim import demo_images, topics
@@ -28,7 +29,7 @@ from calibslam_sim.progress import Progress
 from calibslam_sim.reference import read_reference
 from calibslam_sim.simulation import SCENARIOS, SimulationSettings
 
-START_TIMEOUT = 90.0  # [s] for all nodes to be there; compiling for the first time takes a while
+START_TIMEOUT = 90.0  # [s] for all nodes to be there
 SAVE_TIMEOUT = 120.0  # [s]
 REFINEMENT = 1.5  # [s] without measurements until back ends have refined their maps
 LONGEST_REST = 1.5  # [s] without a keyframe; a map that ends earlier misses measurements
@@ -185,6 +186,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         boxes = demo_images.detect(bag, detected)
         demo_images.write_overlay(bag, detected, out / "overlay.png")
         say(f"{boxes} boxes, each with a covariance")
+        say("loading the back end; the first time it is compiled, which takes half a minute")
+        load_kernels()  # once, for all of them
         say(f"playing it at {arguments.rate:g} times its speed to odometry and {len(CONDITIONS)} back ends")
         for condition in CONDITIONS:
             folder = out / condition.name
