@@ -20,12 +20,14 @@ from calibslam_backend.run_folder import RunRecord, write_run
 from calibslam_backend.transform import transform_from_text
 from calibslam_msgs_py import bags
 from calibslam_msgs_py.bags import BagError, BagReader, BagWriter
+from calibslam_msgs_py.command import command
 from calibslam_msgs_py.measurements import SECOND, Boxes, InvalidMeasurement
 from calibslam_msgs_py.settings import SettingsError, add_arguments, from_arguments
 
 MAP_PERIOD = 2.0  # [s] of recorded time between two maps in run.mcap
 
 
+@command
 def main(arguments: Sequence[str] | None = None) -> int:
     """Entry of the executable; returns the exit code."""
     parser = argparse.ArgumentParser(prog="slam_bag", description=__doc__)

@@ -24,6 +24,7 @@ from calibslam_detector.overlay import draw_overlay
 from calibslam_detector.weights_file import SHIPPED, WeightsError
 from calibslam_msgs_py import bags
 from calibslam_msgs_py.bags import BagError, BagReader, BagWriter
+from calibslam_msgs_py.command import command
 from calibslam_msgs_py.conversions import boxes_to_msg, header_to_msg, stamp_from_msg, valid_boxes
 from calibslam_msgs_py.measurements import Boxes, InvalidMeasurement
 from calibslam_msgs_py.settings import Settings, SettingsError, add_arguments, from_arguments, setting
@@ -148,6 +149,7 @@ def _overlay(image: np.ndarray, boxes: Boxes) -> Any:
     return bags.types(COMPRESSED)(header=header, format="jpeg", data=data)
 
 
+@command
 def main(argv: Sequence[str] | None = None) -> int:
     """Command line of `detect_bag`; returns the exit code."""
     parser = argparse.ArgumentParser(

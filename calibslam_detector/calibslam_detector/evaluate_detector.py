@@ -27,6 +27,7 @@ from calibslam_detector.coco_data import BOX_KEYS, CocoData, DataError, load_coc
 from calibslam_detector.detector import Detector, DetectorSettings, DeviceError
 from calibslam_detector.matching import free_of_border, match
 from calibslam_detector.weights_file import SHIPPED, WeightsError
+from calibslam_msgs_py.command import command
 from calibslam_msgs_py.measurements import Array, Boxes
 from calibslam_msgs_py.settings import Settings, add_arguments, from_arguments, setting
 
@@ -156,6 +157,7 @@ def _as_coco(data: CocoData) -> dict[str, Any]:
     }
 
 
+@command
 def main(argv: Sequence[str] | None = None) -> int:
     """Command line of `evaluate_detector`; returns the exit code."""
     parser = argparse.ArgumentParser(prog="evaluate_detector", description=__doc__)

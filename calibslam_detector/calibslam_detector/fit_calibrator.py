@@ -24,6 +24,7 @@ from calibslam_detector.calibrator_features import FEATURES, edge_features
 from calibslam_detector.edge_mixture import EdgeMixture, fit_mixture
 from calibslam_detector.log_linear_calibrator import LogLinearCalibrator
 from calibslam_msgs_py.bags import BagError
+from calibslam_msgs_py.command import command
 from calibslam_msgs_py.measurements import Array, Boxes
 
 MIN_OBJECTS = 5
@@ -188,6 +189,7 @@ def references(bag: str) -> Sequence[ReferencedImage]:
     return images
 
 
+@command
 def main(arguments: Sequence[str] | None = None) -> int:
     """Entry of the executable; returns the exit code."""
     parser = argparse.ArgumentParser(prog="fit_calibrator", description=__doc__)

@@ -26,6 +26,7 @@ from calibslam_detector.detector_task import Processes, detector_task
 from calibslam_detector.network import ARCHITECTURES, CalibratedDetector
 from calibslam_detector.training_loop import Interrupted, LoopSettings, TrainingError, optimise
 from calibslam_detector.weights_file import WeightsError
+from calibslam_msgs_py.command import command
 from calibslam_msgs_py.settings import Settings, add_arguments, from_arguments, setting
 
 MIN_EXAMPLES = 64  # of the covariance head
@@ -44,6 +45,7 @@ class TrainSettings(Settings):
     boxes: str = setting(BOX_KEYS[0], "which boxes are learnt: of visible parts or of whole objects", choices=BOX_KEYS)
 
 
+@command
 def main(argv: Sequence[str] | None = None) -> int:
     """Command line of `train`; returns the exit code."""
     arguments = _arguments(argv)

@@ -22,6 +22,7 @@ from typing import Any
 from calibslam_backend.kernels import load_kernels
 from calibslam_backend.object_map import ObjectMap
 from calibslam_msgs_py.bags import BagError, BagReader
+from calibslam_msgs_py.command import command
 from calibslam_sim import demo_images, topics
 from calibslam_sim.evaluate import evaluate
 from calibslam_sim.processes import POLL, ProcessFailed, ProcessGroup
@@ -156,6 +157,7 @@ def table(results: dict[str, dict[str, Any]]) -> str:
     return "\n".join(lines)
 
 
+@command
 def main(argv: Sequence[str] | None = None) -> int:
     """Command line of `demo`; returns the exit code."""
     parser = argparse.ArgumentParser(

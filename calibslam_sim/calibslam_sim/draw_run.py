@@ -19,6 +19,7 @@ from calibslam_backend.recording import Recording
 from calibslam_detector.image_conversion import decode_image, encode_jpeg
 from calibslam_detector.overlay import class_colour, draw_overlay
 from calibslam_msgs_py.bags import BagError, BagReader
+from calibslam_msgs_py.command import command
 from calibslam_msgs_py.conversions import stamp_from_msg
 from calibslam_msgs_py.measurements import SECOND, Array, Boxes, Camera, InvalidMeasurement
 from calibslam_sim import topics
@@ -104,6 +105,7 @@ def draw_run(run: Path, bag_path: Path, out: Path) -> int:
     return count
 
 
+@command
 def main(argv: Sequence[str] | None = None) -> int:
     """Command line of `draw_run`; returns the exit code."""
     parser = argparse.ArgumentParser(

@@ -22,6 +22,7 @@ from calibslam_backend.odometry import MotionChain, MotionNoise, dead_reckoning
 from calibslam_backend.plots import plot_run
 from calibslam_backend.quadric import Ellipsoid
 from calibslam_backend.run_folder import accuracy
+from calibslam_msgs_py.command import command
 from calibslam_msgs_py.measurements import Array, RelativeMotion
 from calibslam_sim.object_accuracy import object_accuracy
 from calibslam_sim.reference import NoReference, Reference, read_reference
@@ -97,6 +98,7 @@ def _row(name: str, metrics: dict[str, Any], key: str, style: str) -> str:
     return f"{name:24}{texts[0]:>12}{texts[1]:>16}"
 
 
+@command
 def main(argv: Sequence[str] | None = None) -> int:
     """Command line of `evaluate`; returns the exit code."""
     parser = argparse.ArgumentParser(

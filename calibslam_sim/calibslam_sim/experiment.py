@@ -12,6 +12,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
+from calibslam_msgs_py.command import command
 from calibslam_msgs_py.settings import SettingsError, add_arguments, from_arguments
 from calibslam_sim.experiments.design import Experiment, ExperimentError, ExperimentSettings
 from calibslam_sim.experiments.engine import run
@@ -100,6 +101,7 @@ def _positive(text: str) -> int:
     return number
 
 
+@command
 def main(argv: Sequence[str] | None = None) -> int:
     """Command line of `experiment`; returns the exit code."""
     words = sys.argv[1:] if argv is None else list(argv)

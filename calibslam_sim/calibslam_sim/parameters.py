@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from importlib.metadata import entry_points
 from pathlib import Path
 
+from calibslam_msgs_py.command import command
 from calibslam_msgs_py.parameter_files import NodeParameters, markdown_text, yaml_text
 
 COMMAND = "./calibslam run calibslam_sim parameters"
@@ -34,6 +35,7 @@ def files() -> dict[Path, str]:
     return result
 
 
+@command
 def main(arguments: Sequence[str] | None = None) -> int:
     """Entry of the executable; returns the exit code."""
     parser = argparse.ArgumentParser(prog="parameters", description=__doc__)

@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
+from calibslam_msgs_py.command import command
 from calibslam_msgs_py.measurements import SECOND
 from calibslam_msgs_py.settings import Settings, add_arguments, from_arguments, setting
 from calibslam_sim.camera_path import LAP, START
@@ -52,6 +53,7 @@ def render_dataset(settings: DatasetSettings, writer: CocoWriter) -> None:
                 progress.step()
 
 
+@command
 def main(argv: Sequence[str] | None = None) -> int:
     """Command line of `render_dataset`; returns the exit code."""
     parser = argparse.ArgumentParser(prog="render_dataset", description=__doc__)

@@ -10,12 +10,14 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
+from calibslam_msgs_py.command import command
 from calibslam_sim.run_report.loading import ReportError, load_runs
 from calibslam_sim.run_report.page import page
 
 MEGABYTE = 1e6
 
 
+@command
 def main(argv: Sequence[str] | None = None) -> int:
     """Command line of `report`; returns the exit code."""
     parser = argparse.ArgumentParser(

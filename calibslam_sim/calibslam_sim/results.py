@@ -12,6 +12,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from calibslam_msgs_py.command import command
 from calibslam_sim.experiments.design import Experiment
 from calibslam_sim.experiments.outputs import mean_and_deviation, rows_of_conditions, rows_of_pairs
 from calibslam_sim.experiments.registry import MODULES, load
@@ -83,6 +84,7 @@ def _markdown(rows: Sequence[Sequence[str]]) -> str:
     return "\n".join([lines[0], "|---" * len(rows[0]) + "|", *lines[1:]])
 
 
+@command
 def main(argv: Sequence[str] | None = None) -> int:
     """Command line of `results`; returns the exit code."""
     parser = argparse.ArgumentParser(

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from calibslam_msgs_py import bags
+from calibslam_msgs_py.command import command
 from calibslam_msgs_py.conversions import (
     boxes_to_msg,
     camera_to_msg,
@@ -93,6 +94,7 @@ def _image(stamp: int, frame_id: str, image: RenderedImage) -> Any:
     )
 
 
+@command
 def main(argv: Sequence[str] | None = None) -> int:
     """Command line of `simulate`; returns the exit code."""
     # The scenario decides the defaults of the other options.

@@ -16,6 +16,7 @@ import cv2
 import numpy as np
 
 from calibslam_msgs_py import bags
+from calibslam_msgs_py.command import command
 from calibslam_msgs_py.conversions import boxes_to_msg, camera_to_msg, header_to_msg, stamped_pose_to_msg
 from calibslam_msgs_py.measurements import Boxes, Camera
 from calibslam_sim import topics
@@ -174,6 +175,7 @@ def convert(
     return counts, notes
 
 
+@command
 def main(argv: Sequence[str] | None = None) -> int:
     """Command line of `tum_to_bag`; returns the exit code."""
     parser = argparse.ArgumentParser(
