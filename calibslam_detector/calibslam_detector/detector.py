@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -28,7 +29,7 @@ class DetectorSettings(Settings):
 
     score_threshold: float = setting(0.5, "boxes of a smaller score are left out", low=0.0, high=1.0)
     device: str = setting("auto", "auto: CUDA where it is, else CPU", choices=DEVICES)
-    threads: int = setting(0, "of the CPU; 0: as many as torch takes", low=0)
+    threads: int = setting(0, "of the CPU; 0: one less than it has cores, for the other nodes", low=0)
 
 
 class Detector:
@@ -44,8 +45,10 @@ class Detector:
 
     def __init__(self, model: CalibratedDetector, settings: DetectorSettings) -> None:
         self.device = _device(settings.device)
-        if settings.threads:
-            torch.set_num_threads(settings.threads)
+        # One thread too many costs more than one too few: torch's wait for each other. On 2 busy cores an image takes 0.6 s
+        # with two threads and 0.14 s with one; where nothing else runs 0.06 s and 0.09 s.
+        others = max(len(os.sched_getaffinity(0)) - 1, 1)
+        torch.set_num_threads(settings.threads or min(others, torch.get_num_threads()))
         self.class_names, self.boxes = model.class_names, model.boxes
         self._model = model.to(self.device).eval()
         self._model.detector.roi_heads.score_thresh = settings.score_threshold

@@ -30,7 +30,7 @@ from calibslam_sim.progress import Progress
 from calibslam_sim.reference import read_reference
 from calibslam_sim.simulation import SCENARIOS, SimulationSettings
 
-START_TIMEOUT = 90.0  # [s] for all nodes to be there
+START_TIMEOUT = 180.0  # [s] for all nodes to be there
 SAVE_TIMEOUT = 120.0  # [s]
 REFINEMENT = 1.5  # [s] without measurements until back ends have refined their maps
 LONGEST_REST = 1.5  # [s] without a keyframe; a map that ends earlier misses measurements
