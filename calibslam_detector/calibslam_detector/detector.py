@@ -45,8 +45,8 @@ class Detector:
 
     def __init__(self, model: CalibratedDetector, settings: DetectorSettings) -> None:
         self.device = _device(settings.device)
-        # One thread too many costs more than one too few: torch's wait for each other. On 2 busy cores an image takes 0.6 s
-        # with two threads and 0.14 s with one; where nothing else runs 0.06 s and 0.09 s.
+        # One thread too many costs more than one too few, since they wait for each other: on 2 busy cores an image
+        # takes 0.6 s with two and 0.14 s with one; where nothing else runs 0.06 s and 0.09 s.
         others = max(len(os.sched_getaffinity(0)) - 1, 1)
         torch.set_num_threads(settings.threads or min(others, torch.get_num_threads()))
         self.class_names, self.boxes = model.class_names, model.boxes
