@@ -58,8 +58,9 @@ class Frame:
 
     @functools.cached_property
     def arrays(self) -> list[Array]:
-        """(N, ...) corners, whiteners, bounds and clip of the boxes."""
-        return stacked(self.boxes)
+        """(N, ...) corners, covariances, bounds and clip of the boxes."""
+        corners, whiteners, bounds, clip = stacked(self.boxes)
+        return [corners, np.linalg.inv(whiteners.transpose(0, 2, 1) @ whiteners), bounds, clip]
 
 
 @dataclass

@@ -183,12 +183,22 @@ def overlaps_at(T, centres, surfaces, K, size, corners, compatible):  # type: ig
     Zero for pairs that are not compatible (N, M).
     """
     result = np.zeros((len(corners), len(centres)))
-    R = np.ascontiguousarray(T[:3, :3])
+    c, N = np.empty(3), np.empty((3, 3))
     for m in range(len(centres)):
-        c = R.T @ (centres[m] - T[:3, 3])
+        # c = R^T (centre - t) and N = R^T surface R - c c^T, its upper half: loops, since products of small matrices
+        # spend their time on memory.
+        for a in range(3):
+            c[a] = 0.0
+            for i in range(3):
+                c[a] += T[i, a] * (centres[m, i] - T[i, 3])
         if c[2] <= 0.0:
             continue
-        N = R.T @ surfaces[m] @ R - np.outer(c, c)
+        for a in range(3):
+            for b in range(a, 3):
+                N[a, b] = -c[a] * c[b]
+                for i in range(3):
+                    for j in range(3):
+                        N[a, b] += T[i, a] * surfaces[m, i, j] * T[j, b]
         if N[2, 2] >= 0.0:
             continue
         x, y = N[0, 2] / N[2, 2], N[1, 2] / N[2, 2]

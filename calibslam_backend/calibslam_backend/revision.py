@@ -58,14 +58,14 @@ class Revision:
 
         Args:
             T_map_camera: (4, 4) of the keyframe.
-            boxes: corners (N, 4), whiteners (N, 4, 4), bounds (N, 4) and clip (N, 4) of N boxes.
+            boxes: corners (N, 4), covariances (N, 4, 4), bounds (N, 4) and clip (N, 4) of N boxes.
             classes: N, that they carry.
             by_track: N; to which quadrics the boxes of the same track are given at present, how often.
         """
         T, settings = np.ascontiguousarray(T_map_camera), self._settings
         cost = squared_distances(T, self._quadrics, self._shapes, self._K, self._image, *boxes, settings.model_error)
-        for n, (class_id, track) in enumerate(zip(classes, by_track, strict=True)):
-            cost[:, n] += self._class_cost(class_id)
+        cost += np.reshape([self._class_cost(class_id) for class_id in classes], cost.T.shape).T
+        for n, track in enumerate(by_track):
             if track:
                 cost[:, n] += 0.5 * COHERENCE
                 for j, number in track.items():
@@ -85,7 +85,7 @@ class Revision:
 
 
 @numba.njit(cache=True)
-def squared_distances(T, quadrics, surfaces, K, size, corners, whiteners, bounds, clip, model_error):  # type: ignore[no-untyped-def]
+def squared_distances(T, quadrics, surfaces, K, size, corners, covariances, bounds, clip, model_error):  # type: ignore[no-untyped-def]
     """(M, N) squared Mahalanobis distance of N boxes to those of M quadrics, whose surfaces are their `shapes`.
 
     Infinite if they do not overlap.
@@ -101,7 +101,7 @@ def squared_distances(T, quadrics, surfaces, K, size, corners, whiteners, bounds
             visible, box, _ = box_of_visible_part(T, quadrics[m], K, bounds[n], clip[n])
             if not visible:
                 continue
-            S = np.linalg.inv(whiteners[n].T @ whiteners[n])
+            S = covariances[n].copy()
             for edge in range(4):
                 S[edge, edge] += (model_error * (box[edge % 2 + 2] - box[edge % 2])) ** 2
             difference = box - corners[n]

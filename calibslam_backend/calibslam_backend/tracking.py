@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections import Counter
 from dataclasses import dataclass, field
 
+import numba
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
@@ -45,13 +46,19 @@ class Track:
             self.class_id = class_id
 
 
-def overlap(a: Array, b: Array) -> Array:
+@numba.njit(cache=True)
+def overlap(a, b):  # type: ignore[no-untyped-def]
     """Intersection over union (N, M) of boxes (N, 4) and (M, 4) [px]."""
-    low = np.maximum(a[:, None, :2], b[None, :, :2])
-    high = np.minimum(a[:, None, 2:], b[None, :, 2:])
-    shared = np.clip(high - low, 0.0, None).prod(axis=2)
-    areas = [(boxes[:, 2:] - boxes[:, :2]).prod(axis=1) for boxes in (a, b)]
-    return np.asarray(shared / (areas[0][:, None] + areas[1][None, :] - shared))
+    result = np.zeros((len(a), len(b)))
+    for n in range(len(a)):
+        for m in range(len(b)):
+            width = min(a[n, 2], b[m, 2]) - max(a[n, 0], b[m, 0])
+            height = min(a[n, 3], b[m, 3]) - max(a[n, 1], b[m, 1])
+            if width > 0.0 and height > 0.0:
+                shared = width * height
+                areas = (a[n, 2] - a[n, 0]) * (a[n, 3] - a[n, 1]) + (b[m, 2] - b[m, 0]) * (b[m, 3] - b[m, 1])
+                result[n, m] = shared / (areas - shared)
+    return result
 
 
 def unique(corners: Array, scores: Array, max_overlap: float) -> NDArray[np.int_]:
@@ -67,10 +74,10 @@ def unique(corners: Array, scores: Array, max_overlap: float) -> NDArray[np.int_
 def rotated(corners: Array, R_now_before: Array, K: Array) -> Array:
     """Where boxes (N, 4) [px] appear after the camera has turned; infinitely far objects, corners' centre and size."""
     H = K @ R_now_before @ np.linalg.inv(K)
-    x, y = 0.5 * (corners[:, 0] + corners[:, 2]), 0.5 * (corners[:, 1] + corners[:, 3])
-    p = np.stack([x, y, np.ones_like(x)], axis=1) @ H.T
-    shift = p[:, :2] / np.maximum(p[:, 2:], 0.1) - np.stack([x, y], axis=1)
-    return corners + np.concatenate([shift, shift], axis=1)
+    centres = 0.5 * (corners[:, :2] + corners[:, 2:])
+    p = centres @ H[:, :2].T + H[:, 2]
+    shift = p[:, :2] / np.maximum(p[:, 2:], 0.1) - centres
+    return corners + np.tile(shift, 2)
 
 
 class Tracker:
@@ -96,13 +103,14 @@ class Tracker:
         """
         oldest = stamp - int(self._settings.max_gap * SECOND)
         self.tracks = [track for track in self.tracks if track.stamp >= oldest]
+        moved = np.reshape([track.corners for track in self.tracks], (-1, 4))
         if self.tracks:
-            moved = rotated(np.stack([track.corners for track in self.tracks]), R_now_before, self._K)
+            moved = rotated(moved, R_now_before, self._K)
             for track, box in zip(self.tracks, moved, strict=True):
                 track.corners = box
         found: list[Track | None] = [None] * len(corners)
         if self.tracks and len(corners):
-            score = overlap(np.stack([track.corners for track in self.tracks]), corners)
+            score = overlap(moved, corners)
             other = np.array([[track.class_id != c for c in class_ids] for track in self.tracks])
             score = score - self.CLASS_CHANGE * other
             for t, b in zip(*linear_sum_assignment(-np.maximum(score, 0.0)), strict=True):

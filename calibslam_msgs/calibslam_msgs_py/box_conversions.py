@@ -28,14 +28,17 @@ def boxes_from_msg(msg: Any) -> Boxes:
     """
     if msg.width < 1 or msg.height < 1:
         raise InvalidMeasurement("image_size", f"boxes of an image of {msg.width} x {msg.height} pixels")
-    corners = [doubles_of(box.corners, 4, "corners of a box") for box in msg.boxes]
-    covariances = [_box_covariance(doubles_of(box.covariance, 16, "covariance of a box")) for box in msg.boxes]
+    corners = _doubles_of_all([box.corners for box in msg.boxes], 4, "corners of a box")
+    covariances = _doubles_of_all([box.covariance for box in msg.boxes], 16, "covariance of a box")
+    # NaN in a message is a defect and not "unknown": it becomes infinite, which no check lets pass.
+    unknown = covariances[:, :1] == UNKNOWN
+    covariances = np.where(unknown, np.nan, np.where(np.isnan(covariances), np.inf, covariances))
     return Boxes(
         stamp=stamp_from_msg(msg.header.stamp),
         width=int(msg.width),
         height=int(msg.height),
-        corners=np.array(corners).reshape(-1, 4),
-        covariances=np.array(covariances).reshape(-1, 4, 4),
+        corners=corners,
+        covariances=covariances.reshape(-1, 4, 4),
         class_ids=tuple(str(box.class_id) for box in msg.boxes),
         scores=np.array([box.score for box in msg.boxes], dtype=np.float64),
         object_ids=tuple(str(box.object_id) for box in msg.boxes),
@@ -43,14 +46,11 @@ def boxes_from_msg(msg: Any) -> Boxes:
     )
 
 
-def _box_covariance(flat: Array) -> Array:
-    """(4, 4), NaN throughout where unknown.
-
-    NaN in a message is a defect and not "unknown": it becomes infinite, which no check lets pass.
-    """
-    if flat[0] == UNKNOWN:
-        return np.full((4, 4), np.nan)
-    return np.where(np.isnan(flat), np.inf, flat).reshape(4, 4)
+def _doubles_of_all(arrays: list[Any], n: int, what: str) -> Array:
+    """(N, n) of N array fields."""
+    if all(len(values) == n for values in arrays):
+        return np.array(arrays, dtype=np.float64).reshape(-1, n)
+    return np.stack([doubles_of(values, n, what) for values in arrays])
 
 
 def valid_boxes(boxes: Boxes) -> tuple[Boxes, dict[str, int]]:
@@ -62,12 +62,14 @@ def valid_boxes(boxes: Boxes) -> tuple[Boxes, dict[str, int]]:
     """
     xmin, ymin, xmax, ymax = boxes.corners.T
     finite = (np.abs(boxes.corners) <= LARGEST_COORDINATE).all(axis=1) & np.isfinite(boxes.scores)
+    wrong = boxes.has_covariance
+    wrong[wrong] = ~is_covariance(boxes.covariances[wrong])
     outside = (xmax <= 0.0) | (ymax <= 0.0) | (xmin >= boxes.width) | (ymin >= boxes.height)
     defects = {
         "nan": ~finite,
         "empty": (xmin >= xmax) | (ymin >= ymax),
         "outside": outside,
-        "covariance": boxes.has_covariance & ~is_covariance(boxes.covariances),
+        "covariance": wrong,
     }
     keep = np.ones(len(boxes), dtype=bool)
     rejected = {}
