@@ -21,6 +21,7 @@ from dataclasses import dataclass
 import gtsam
 import numpy as np
 
+from calibslam_backend.assignments import Assignments
 from calibslam_backend.association import GIVEN
 from calibslam_backend.box_measurement import undistorted
 from calibslam_backend.data_association import DataAssociation
@@ -33,6 +34,7 @@ from calibslam_backend.odometry import MotionChain
 from calibslam_backend.quadric import Ellipsoid, covariance_of_pose_and_radii, covariance_of_vector
 from calibslam_backend.relocalisation import FOUND, Relocalised
 from calibslam_backend.tracking import Tracker, unique
+from calibslam_backend.upkeep import Upkeep
 from calibslam_msgs_py.measurements import (
     SECOND,
     Array,
@@ -96,7 +98,9 @@ class Estimator:
         self._motions = MotionChain(self.settings, self._T_body_camera)
         self._tracker = Tracker(self.settings, self.camera.K)
         self._graph = ObjectGraph(self.camera.K, self.settings, self.settings, self.settings)
-        self._objects = DataAssociation(self._graph, self.camera, self.settings, self.counts)
+        self._assignments = Assignments(self._graph)
+        self._objects = DataAssociation(self._assignments, self.camera, self.settings, self.counts)
+        self._upkeep = Upkeep(self._assignments, self.camera, self.settings, self.counts)
         self._known: Set[int] = set()  # quadrics after the last keyframe
         self._repairs: list[str] = []
         self._between = 0.0
@@ -165,10 +169,10 @@ class Estimator:
         if not self.stamps:
             return
         for _ in range(self.ROUNDS):
-            changed = self._objects.revise()
+            changed = self._upkeep.revise()
             self._objects.start_leftovers()
             self._converge(self.ITERATIONS_OF_A_ROUND)
-            self._objects.merge()
+            self._upkeep.merge()
             if not changed:
                 break
         self._converge(self.ITERATIONS)
@@ -219,7 +223,7 @@ class Estimator:
             result.append(
                 QuadricEstimate(
                     j,
-                    self._objects.class_of_quadric(j),
+                    self._assignments.class_of_quadric(j),
                     ellipsoid.T_world_object,
                     ellipsoid.radii,
                     covariance_of_pose_and_radii(vector, covariance),
@@ -260,7 +264,7 @@ class Estimator:
             vector = Ellipsoid(quadric.T_map_object, quadric.radii).vector()
             covariance = covariance_of_vector(quadric.T_map_object, quadric.radii, quadric.covariance)
             classes = Counter({quadric.class_id: max(quadric.observations, 1)})
-            self._objects.know(quadric.id, vector, covariance, classes)
+            self._assignments.know(quadric.id, vector, covariance, classes)
 
     def begin_again(self, keep_map: bool) -> None:
         """Forget the trajectory, and the objects unless the map is kept: then as in a loaded map."""
@@ -281,7 +285,7 @@ class Estimator:
 
     def associations(self) -> list[tuple[int | None, str]]:
         """For each box of a keyframe the quadric it is given to, and its true identity ("": unknown)."""
-        frames = self._objects.frames
+        frames = self._assignments.frames
         return [pair for frame in frames for pair in zip(frame.quadrics, frame.names, strict=True)]
 
     def optimise(self) -> None:
@@ -346,7 +350,7 @@ class Estimator:
             corners = undistorted(boxes.corners, self.camera)
             linked = self._tracker.update(boxes.stamp, corners, boxes.class_ids, R_now_before)
             tracks = [track.id for track in linked]
-        self._objects.see(tracks, boxes.class_ids)
+        self._assignments.see(tracks, boxes.class_ids)
         return boxes, tracks
 
     def _moved(self, motion: Array, duration: int) -> bool:
@@ -385,10 +389,10 @@ class Estimator:
         def look_for_known_and_new() -> None:
             if k:
                 objects.relocalise(k)
-            objects.start_quadrics(objects.frames[k].tracks)
+            objects.start_quadrics(self._assignments.frames[k].tracks)
 
         def revise() -> None:
-            objects.revise(-(-self.settings.revised // 2))
+            self._upkeep.revise(-(-self.settings.revised // 2))
 
         return [look_for_known_and_new, revise, revise, self._settle]
 
@@ -437,7 +441,7 @@ class Estimator:
         if motion is not None:
             objects.vote(k, motion.covariance)
         self._note(self._graph.update())
-        objects.merge()
+        self._upkeep.merge()
         self._chores = self._chores_of(k)
         self._known = set(self._graph.landmarks)
         repaired, self._repairs = "; ".join(self._repairs), []

@@ -157,6 +157,11 @@ class ObjectGraph:
         """(6, 6) [rotation, translation] of keyframe k in its body."""
         return self._smoother.marginal(_x(k))
 
+    def distance(self, k: int, T_map_camera: Array) -> float:
+        """Mahalanobis distance of keyframe k from where it is estimated to be, if it were at this pose (4, 4)."""
+        difference = gtsam.Pose3(self.pose(k)).localCoordinates(gtsam.Pose3(T_map_camera))
+        return float(np.sqrt(difference @ np.linalg.solve(self.pose_covariance(k), difference)))
+
     def quadric_covariances(self) -> dict[int, Array]:
         """For each quadric (9, 9) of its vector; its prior's where no update has been done yet."""
         solved = [j for j in self.landmarks if self.is_solved(j)]

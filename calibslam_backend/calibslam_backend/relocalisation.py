@@ -9,7 +9,7 @@ odometry predicts.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 
@@ -64,6 +64,7 @@ def relocalise(
     image: tuple[int, int],
     robust_scale: float,
     settings: RelocalisationSettings,
+    is_plausible: Callable[[Array], bool] = lambda T: True,
 ) -> Relocalised | None:
     """A better pose than the predicted one, or None.
 
@@ -76,6 +77,7 @@ def relocalise(
         image: width and height [px].
         robust_scale: as in the factor graph.
         settings: what a pose must explain.
+        is_plausible: whether a pose (4, 4) may be the camera's by what else is known; asked of few.
     """
     if len(boxes) < settings.relocalisation_boxes or np.count_nonzero(compatible) < settings.relocalisation_boxes:
         return None
@@ -109,7 +111,7 @@ def relocalise(
                     break
                 T = fit(T, [quadrics[j] for _, j in pairs], [boxes[i] for i, _ in pairs], K, robust_scale)
                 pairs = explained(T)
-            if len(pairs) >= needed and (best is None or len(pairs) > len(best.pairs)):
+            if len(pairs) >= needed and (best is None or len(pairs) > len(best.pairs)) and is_plausible(T):
                 best = Relocalised(T, pairs)
         if best is not None:
             return best

@@ -3,12 +3,13 @@
 When a box was seen its quadric may not have been in the map, or the pose was still wrong: after a loop is closed, much
 is clear that was not. Given poses and quadrics, the boxes of a keyframe are assigned all at once, each to a quadric
 or to none. The cost of a pair is the squared Mahalanobis distance of the box to the one predicted, minus two log of
-how likely the quadric's boxes carry that class, minus a bonus if the box's track goes there elsewhere; to be given
+how likely the quadric's boxes carry that class, minus a bonus if the neighbours in its track fit there too; to be given
 to no quadric costs as much as the gate. (The step of expectation to the step of maximisation that the graph is.)
 """
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Sequence
 
@@ -20,7 +21,40 @@ from calibslam_backend.quadric import box_of_visible_part, shapes
 from calibslam_backend.relocalisation import overlaps_at
 from calibslam_msgs_py.measurements import Array
 
-COHERENCE = 10.0  # bonus of a pair if all boxes of the track go to that quadric, half of it is lost if none
+SPAN = 4  # keyframes after which a neighbour in a track counts 1/e
+REACH = 3 * SPAN  # farther ones do not count
+FADING = [math.exp(-distance / SPAN) for distance in range(REACH + 1)]
+COHERENCE = 10.0  # bonus of a pair if the track goes to that quadric for sure, half of it is lost if it surely does not
+
+
+class Evidence:
+    """What the boxes of a track say, each by itself, of whose they are.
+
+    Neighbours in time are believed together, those far apart are not: a track may have slipped to another object.
+    """
+
+    def __init__(self) -> None:
+        self._fits: dict[int, dict[int, float]] = {}
+
+    def learn(self, k: int, fits: dict[int, float]) -> None:
+        """How well the box of keyframe k fits which quadrics: its cost less that of no quadric, where negative."""
+        self._fits[k] = fits
+
+    def fits(self, k: int) -> dict[int, float] | None:
+        """As learnt of the box of keyframe k; None: it was not judged so far."""
+        return self._fits.get(k)
+
+    def shares(self, k: int) -> dict[int, float]:
+        """Probability that the object seen around keyframe k is which quadric; what is missing from 1: none."""
+        sums: dict[int, float] = {}
+        for other, fits in self._fits.items():
+            if (distance := abs(k - other)) <= REACH:
+                for j, fit in fits.items():
+                    sums[j] = sums.get(j, 0.0) + FADING[distance] * fit
+        least = min(sums.values(), default=0.0)
+        odds = {j: math.exp(0.5 * (least - value)) for j, value in sums.items()}
+        total = sum(odds.values()) + math.exp(0.5 * least)
+        return {j: each / total for j, each in odds.items()}
 
 
 class Revision:
@@ -52,7 +86,12 @@ class Revision:
         self._class_costs: dict[str, Array] = {}
 
     def judge(
-        self, T_map_camera: Array, boxes: Sequence[Array], classes: Sequence[str], by_track: Sequence[Counter[int]]
+        self,
+        T_map_camera: Array,
+        boxes: Sequence[Array],
+        classes: Sequence[str],
+        tracks: Sequence[Evidence],
+        k: int,
     ) -> list[int | None]:
         """For each of N boxes of a keyframe the id of its quadric, or None.
 
@@ -60,17 +99,20 @@ class Revision:
             T_map_camera: (4, 4) of the keyframe.
             boxes: corners (N, 4), covariances (N, 4, 4), bounds (N, 4) and clip (N, 4) of N boxes.
             classes: N, that they carry.
-            by_track: N; to which quadrics the boxes of the same track are given at present, how often.
+            tracks: N, the evidence of their tracks, which learns what these boxes say.
+            k: number of the keyframe.
         """
         T, settings = np.ascontiguousarray(T_map_camera), self._settings
         cost = squared_distances(T, self._quadrics, self._shapes, self._K, self._image, *boxes, settings.model_error)
         cost += np.reshape([self._class_cost(class_id) for class_id in classes], cost.T.shape).T
-        for n, track in enumerate(by_track):
-            if track:
-                cost[:, n] += 0.5 * COHERENCE
-                for j, number in track.items():
-                    cost[self._row[j], n] -= COHERENCE * number / track.total()
         gate = gate_of(settings.gate)
+        fits = np.minimum(cost - gate, 0.0)
+        for n, track in enumerate(tracks):
+            track.learn(k, {self._ids[m]: float(fits[m, n]) for m in np.flatnonzero(fits[:, n])})
+            cost[:, n] += 0.5 * COHERENCE
+            for j, share in track.shares(k).items():
+                if j in self._row:
+                    cost[self._row[j], n] -= COHERENCE * share
         cost[cost >= gate] = np.inf
         result: list[int | None] = [None] * len(classes)
         for row, column in assign(cost - gate):

@@ -63,7 +63,8 @@ def valid_boxes(boxes: Boxes) -> tuple[Boxes, dict[str, int]]:
     xmin, ymin, xmax, ymax = boxes.corners.T
     finite = (np.abs(boxes.corners) <= LARGEST_COORDINATE).all(axis=1) & np.isfinite(boxes.scores)
     wrong = boxes.has_covariance
-    wrong[wrong] = ~is_covariance(boxes.covariances[wrong])
+    if wrong.any():
+        wrong[wrong] = ~is_covariance(boxes.covariances[wrong])
     outside = (xmax <= 0.0) | (ymax <= 0.0) | (xmin >= boxes.width) | (ymin >= boxes.height)
     defects = {
         "nan": ~finite,
