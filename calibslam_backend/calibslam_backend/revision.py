@@ -108,7 +108,7 @@ class Revision:
         gate = gate_of(settings.gate)
         fits = np.minimum(cost - gate, 0.0)
         for n, track in enumerate(tracks):
-            track.learn(k, {self._ids[m]: float(fits[m, n]) for m in np.flatnonzero(fits[:, n])})
+            track.learn(k, {self._ids[m]: float(fits[m, n]) for m in np.flatnonzero(fits[:, n]).tolist()})
             cost[:, n] += 0.5 * COHERENCE
             for j, share in track.shares(k).items():
                 if j in self._row:

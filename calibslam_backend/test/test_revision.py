@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
@@ -11,7 +12,7 @@ import pytest
 
 from calibslam_backend.association import AssociationSettings, class_costs
 from calibslam_backend.quadric import ALL_EDGES, Ellipsoid, box_of_visible_part, image_bounds, shapes
-from calibslam_backend.revision import COHERENCE, Revision, squared_distances
+from calibslam_backend.revision import COHERENCE, REACH, SPAN, Evidence, Revision, squared_distances
 from calibslam_msgs_py.measurements import Array
 
 K = np.array([[500.0, 0.0, 320.0], [0.0, 500.0, 240.0], [0.0, 0.0, 1.0]])
@@ -39,23 +40,31 @@ QUADRICS = np.stack([at(-0.05), at(0.05)])
 
 
 def arrays(boxes: Sequence[Array]) -> list[Array]:
-    """Corners, whiteners, bounds and clip of boxes, as `Revision.judge` takes them."""
+    """Corners, covariances, bounds and clip of boxes, as `Revision.judge` takes them."""
     n = len(boxes)
-    whiteners, clip = np.tile(np.eye(4) / SIGMA, (n, 1, 1)), np.zeros((n, 4), bool)
-    return [np.reshape(boxes, (n, 4)), whiteners, np.tile(BOUNDS, (n, 1)), clip]
+    covariances, clip = np.tile(np.eye(4) * SIGMA**2, (n, 1, 1)), np.zeros((n, 4), bool)
+    return [np.reshape(boxes, (n, 4)), covariances, np.tile(BOUNDS, (n, 1)), clip]
+
+
+def track(fits: dict[int, dict[int, float]]) -> Evidence:
+    """A track whose boxes fit so, by keyframe and quadric."""
+    evidence = Evidence()
+    for k, fit in fits.items():
+        evidence.learn(k, fit)
+    return evidence
 
 
 def whose(
     boxes: Sequence[Array],
     classes: Sequence[str] | None = None,
-    tracks: Sequence[Counter[int]] | None = None,
+    tracks: Sequence[Evidence] | None = None,
     classes_of: Sequence[Counter[str]] = (CUPS, CUPS),
     settings: AssociationSettings = SETTINGS,
 ) -> list[int | None]:
-    """The quadric of each box, the camera being at the origin."""
+    """The quadric of each box of keyframe 50, the camera being at the origin."""
     revision = Revision(QUADRICS, [LEFT, RIGHT], classes_of, K, (640, 480), settings)
     n = len(boxes)
-    return revision.judge(np.eye(4), arrays(boxes), classes or ["cup"] * n, tracks or [Counter()] * n)
+    return revision.judge(np.eye(4), arrays(boxes), classes or ["cup"] * n, tracks or [Evidence() for _ in boxes], 50)
 
 
 def test_boxes_go_to_the_quadrics_they_fit() -> None:
@@ -64,9 +73,9 @@ def test_boxes_go_to_the_quadrics_they_fit() -> None:
     assert whose(boxes[::-1]) == [RIGHT, LEFT]
 
 
-def test_a_box_given_to_the_neighbour_is_moved() -> None:
-    """Also where its track went there, as long as it fits clearly: 25 px off are more than the bonus of coherence."""
-    wrong = Counter({LEFT: 5})
+def test_a_box_whose_track_fits_the_neighbour_is_moved() -> None:
+    """Also where all of its track fits there, as long as it fits clearly: 25 px off are more than the bonus."""
+    wrong = track({49: {LEFT: -100.0}})
     assert whose([seen(QUADRICS[1])], tracks=[wrong]) == [RIGHT]
 
 
@@ -102,19 +111,43 @@ def test_classes_are_evidence() -> None:
     assert whose([seen(QUADRICS[0])], ["bottle"], classes_of=classes_of) == [LEFT]
 
 
-def test_the_track_decides_a_tie() -> None:
+@pytest.mark.parametrize("expected", [LEFT, RIGHT])
+def test_the_track_decides_a_tie(expected: int) -> None:
     loose = replace(SETTINGS, model_error=0.2)
-    for mostly, expected in ((LEFT, LEFT), (RIGHT, RIGHT)):
-        tracks = [Counter({mostly: 5, LEFT + RIGHT - mostly: 1})]
-        assert whose([seen(at(0.0))], tracks=tracks, settings=loose) == [expected]
+    assert whose([seen(at(0.0))], tracks=[track({48: {expected: -5.0}})], settings=loose) == [expected]
 
 
 @pytest.mark.parametrize(("share", "expected"), [(0.98, LEFT), (1.02, None)])
 def test_the_bonus_of_coherence_by_hand(share: float, expected: int | None) -> None:
-    """A box whose whole track goes to a quadric is taken beyond the gate, by half of the bonus."""
+    """A box whose neighbours surely are of a quadric is taken beyond the gate, by half of the bonus."""
     q = GATE + 0.5 * COHERENCE - class_costs([CUPS], "cup", SETTINGS.wrong_class)[0]
     d = share * SIGMA * np.sqrt(0.5 * q)
-    assert whose([seen(QUADRICS[0]) - d * np.array([1, 0, 1, 0])], tracks=[Counter({LEFT: 5})]) == [expected]
+    sure = track({51: {LEFT: -100.0}})
+    assert whose([seen(QUADRICS[0]) - d * np.array([1, 0, 1, 0])], tracks=[sure]) == [expected]
+
+
+def test_evidence_by_hand() -> None:
+    """Odds exp(fit / 2), of none 1; a neighbour at a distance d counts exp(-d / SPAN)."""
+    evidence = track({10: {LEFT: -4.0, RIGHT: -2.0}, 10 + SPAN: {RIGHT: -3.0}})
+    odds = {LEFT: math.exp(2.0), RIGHT: math.exp(1.0 + 1.5 / math.e)}
+    total = 1.0 + sum(odds.values())
+    assert evidence.shares(10) == pytest.approx({j: each / total for j, each in odds.items()})
+    assert evidence.fits(10 + SPAN) == {RIGHT: -3.0}
+    assert evidence.fits(11) is None
+
+
+def test_evidence_ends_where_a_track_may_have_slipped() -> None:
+    """A track that was on one object for long and then on another: each part by itself."""
+    slipped = track({**{k: {LEFT: -15.0} for k in range(30)}, **{k: {RIGHT: -15.0} for k in range(30, 40)}})
+    assert slipped.shares(20)[LEFT] > 0.99
+    assert slipped.shares(36)[RIGHT] > 0.99
+    assert slipped.shares(40 + REACH) == {}
+
+
+def test_evidence_learns_anew() -> None:
+    evidence = track({10: {LEFT: -4.0}})
+    evidence.learn(10, {RIGHT: -4.0})
+    assert evidence.shares(10) == pytest.approx({RIGHT: 1.0 / (1.0 + math.exp(-2.0))})
 
 
 def test_distances_by_hand() -> None:
