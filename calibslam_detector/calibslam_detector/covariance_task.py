@@ -19,6 +19,7 @@ from tqdm import tqdm
 from calibslam_detector import weights_file
 from calibslam_detector.box_covariance import decoupled
 from calibslam_detector.calibration.f_cal import FCal
+from calibslam_detector.calibration.f_cal_cramer import FCalCramer
 from calibslam_detector.calibration.losses import CalibrationLoss, GaussianNLL
 from calibslam_detector.coco_data import CocoData, read_image, to_tensor
 from calibslam_detector.matching import free_of_border, match
@@ -26,14 +27,14 @@ from calibslam_detector.network import CalibratedDetector, Regions
 from calibslam_detector.training_loop import LoopSettings, Task, batch_of
 
 # Each is the likelihood and, with a weight, a demand for calibration (eq. 4.2.6). The weights put both on one scale:
-# the squared Wasserstein distance is in squared units of a sum of K squares.
+# the squared Wasserstein distance is in squared units of a sum of K squares, that of Cramer and von Mises is below 1/3.
 LOSSES: dict[str, tuple[Callable[[], torch.nn.Module] | None, float]] = {
     "nll": (None, 0.0),
     "f_cal_kl": (lambda: FCal(divergence="kl"), 0.5),
     "f_cal_w": (lambda: FCal(divergence="wasserstein"), 0.01),
+    "f_cal_cramer": (FCalCramer, 0.95),
     "calibration": (CalibrationLoss, 0.5),
 }
-
 
 HELD_OUT = 0.2  # share of the examples, those of the last images, that decide which weights are kept
 
@@ -44,7 +45,7 @@ class Examples:
 
     Attributes:
         features: (M, F) of their regions.
-        geometries: (M, GEOMETRY).
+        cues: (M, CUES).
         labels: (M,).
         residuals: (M, 4) true minus found, in deltas against the region's proposal.
         whole: (M,) whether the object lies inside the image with all its edges.
@@ -52,7 +53,7 @@ class Examples:
     """
 
     features: Tensor
-    geometries: Tensor
+    cues: Tensor
     labels: Tensor
     residuals: Tensor
     whole: Tensor
@@ -96,7 +97,7 @@ def _examples(model: CalibratedDetector, regions: Regions, detected: np.ndarray,
     whole = torch.as_tensor(free_of_border(true_boxes, width, height).all(axis=1))
     return Examples(
         regions.features[indices].cpu(),
-        regions.geometries[indices].cpu(),
+        regions.cues[indices].cpu(),
         regions.labels[indices].cpu(),
         residuals.cpu(),
         whole,
@@ -109,7 +110,7 @@ def covariance_task(
 ) -> Task:
     """The loss of `LOSSES` on batches of examples; only the covariance head changes.
 
-    The weights of the best likelihood of held-out examples are kept: a head of so many weights soon knows its examples
+    The weights of the least loss of held-out examples are kept: a head of so many weights soon knows its examples
     by heart, and then claims too much of others.
     """
     model.to(device).eval().requires_grad_(False)
@@ -120,18 +121,13 @@ def covariance_task(
 
     learnt = len(examples) - round(HELD_OUT * len(examples))
 
-    def predict(chosen: Tensor) -> tuple[Tensor, Tensor]:
-        """Residuals that are independent of each other, and their variances."""
-        features, geometries, labels, residuals = (
-            part[chosen].to(device)
-            for part in (examples.features, examples.geometries, examples.labels, examples.residuals)
+    def evaluate(chosen: Tensor) -> dict[str, Tensor]:
+        """Both terms of eq. 4.2.6, of residuals that are independent of each other."""
+        features, cues, labels, residuals = (
+            part[chosen].to(device) for part in (examples.features, examples.cues, examples.labels, examples.residuals)
         )
-        variances, couplings = head(features, geometries, labels)
-        return decoupled(residuals, couplings), variances
-
-    def losses(step: int) -> dict[str, Tensor]:
-        chosen = torch.from_numpy(batch_of(step, min(batch, learnt), learnt, settings.seed))
-        independent, variances = predict(chosen)
+        variances, couplings = head(features, cues, labels)
+        independent = decoupled(residuals, couplings)
         zero = torch.zeros_like(independent)
         found = {"nll": (1.0 - weight) * risk(zero, variances, independent)}
         if calibration is not None:
@@ -140,10 +136,17 @@ def covariance_task(
             found["calibration"] = weight * calibration(zero[whole], variances[whole], independent[whole])
         return found
 
+    def losses(step: int) -> dict[str, Tensor]:
+        return evaluate(torch.from_numpy(batch_of(step, min(batch, learnt), learnt, settings.seed)))
+
     @torch.no_grad()
     def held_out() -> float:
-        independent, variances = predict(torch.arange(learnt, len(examples)))
-        return float(risk(torch.zeros_like(independent), variances, independent))
+        head.eval()
+        with torch.random.fork_rng():
+            torch.manual_seed(settings.seed)  # of f-Cal's sums, each time the same
+            found = evaluate(torch.arange(learnt, len(examples)))
+        head.train()
+        return float(sum(found.values()))
 
     return Task(head, list(head.parameters()), losses, device, held_out=held_out)
 

@@ -25,8 +25,9 @@ from torchvision.ops.misc import FrozenBatchNorm2d
 
 from calibslam_detector.box_covariance import corner_covariances, rescaled
 from calibslam_detector.coco_data import BOX_KEYS
-from calibslam_detector.covariance_head import CovarianceHead, geometry
+from calibslam_detector.covariance_head import CovarianceHead
 from calibslam_detector.familiarity import Familiarity, descriptor
+from calibslam_detector.region_cues import LEAST_NEIGHBOUR, Chosen, agreement, geometry, hiding, second_look
 
 # The compact network: a quarter of torchvision's MobileNet detector, and finer levels for small things.
 COMPACT_CHANNELS, COMPACT_FEATURES = 128, 256  # of a level, of a region
@@ -90,7 +91,8 @@ class Regions:
         boxes: (N, 4) [px of the network's input], cut at the border.
         scores, labels: (N,).
         proposals: (N, 4) that the boxes were described against [px of the network's input].
-        features: (N, F) of the regions.
+        features: (N, F) of the boxes, seen as regions once more.
+        cues: (N, CUES), see `region_cues`.
         descriptor: (C,) of the whole image, see `familiarity`.
         size: height and width of the network's input [px].
     """
@@ -100,13 +102,9 @@ class Regions:
     labels: Tensor
     proposals: Tensor
     features: Tensor
+    cues: Tensor
     descriptor: Tensor
     size: tuple[int, int]
-
-    @property
-    def geometries(self) -> Tensor:
-        """(N, GEOMETRY), see `covariance_head.geometry`."""
-        return geometry(self.boxes, self.scores, self.size)
 
 
 class CalibratedDetector(nn.Module):
@@ -151,51 +149,68 @@ class CalibratedDetector(nn.Module):
         features = self.detector.backbone(inputs.tensors)
         proposals, _ = self.detector.rpn(inputs, features)
         heads = self.detector.roi_heads
-        vectors = heads.box_head(heads.box_roi_pool(features, proposals, inputs.image_sizes))
-        logits, deltas = heads.box_predictor(vectors)
-        boxes = heads.box_coder.decode(deltas, proposals)
-        scores = torch.softmax(logits, -1)
+        logits, deltas = heads.box_predictor(
+            heads.box_head(heads.box_roi_pool(features, proposals, inputs.image_sizes))
+        )
         counts = [len(p) for p in proposals]
+        boxes = [
+            clip_boxes_to_image(b, size)
+            for b, size in zip(heads.box_coder.decode(deltas, proposals).split(counts), inputs.image_sizes, strict=True)
+        ]
+        scores = torch.softmax(logits, -1).split(counts)
+        found = [self._find(b, s) for b, s in zip(boxes, scores, strict=True)]
+        chosen = [f[f.scores > heads.score_thresh] for f in found]
+        looks, seen = self._look_again(features, chosen, inputs.image_sizes)
         return [
-            self._choose(*of_image)
-            for of_image in zip(
-                boxes.split(counts), scores.split(counts), proposals, vectors.split(counts),
-                descriptor(features["0"]), inputs.image_sizes, strict=True,
+            Regions(
+                boxes=c.boxes,
+                scores=c.scores,
+                labels=c.labels,
+                proposals=p[c.regions],
+                features=vector,
+                cues=torch.cat([geometry(c, s, size), agreement(c, b, s, p), hiding(c, f), look], dim=1),
+                descriptor=image_descriptor,
+                size=(int(size[0]), int(size[1])),
+            )
+            for c, f, b, s, p, look, vector, image_descriptor, size in zip(
+                chosen, found, boxes, scores, proposals, looks, seen, descriptor(features["0"]), inputs.image_sizes,
+                strict=True,
             )
         ]  # fmt: skip
 
-    def _choose(
-        self,
-        boxes: Tensor,
-        scores: Tensor,
-        proposals: Tensor,
-        features: Tensor,
-        image_descriptor: Tensor,
-        size: tuple[int, int],
-    ) -> Regions:
-        """Of all boxes (P, C, 4) and scores (P, C) of an image those that count, as torchvision chooses them."""
+    def _find(self, boxes: Tensor, scores: Tensor) -> Chosen:
+        """Of all boxes (P, C, 4) and scores (P, C) of an image those that count, as torchvision chooses them; and of
+        smaller scores those that may hide them, so that what hides a box does not depend on the threshold.
+        """
         heads = self.detector.roi_heads
         classes = scores.shape[1] - 1
-        flat_boxes = clip_boxes_to_image(boxes, size)[:, 1:].reshape(-1, 4)
-        flat_scores = scores[:, 1:].reshape(-1)
-        kept = torch.where(flat_scores > heads.score_thresh)[0]
+        flat_boxes, flat_scores = boxes[:, 1:].reshape(-1, 4), scores[:, 1:].reshape(-1)
+        kept = torch.where(flat_scores > min(heads.score_thresh, LEAST_NEIGHBOUR))[0]
         kept = kept[remove_small_boxes(flat_boxes[kept], min_size=1e-2)]
         best = batched_nms(flat_boxes[kept], flat_scores[kept], kept % classes + 1, heads.nms_thresh)
         kept = kept[best[: heads.detections_per_img]]
-        of_proposal = torch.div(kept, classes, rounding_mode="floor")
-        return Regions(
-            boxes=flat_boxes[kept],
-            scores=flat_scores[kept],
-            labels=kept % classes + 1,
-            proposals=proposals[of_proposal],
-            features=features[of_proposal],
-            descriptor=image_descriptor,
-            size=(int(size[0]), int(size[1])),
+        of_region = torch.div(kept, classes, rounding_mode="floor")
+        return Chosen(flat_boxes[kept], flat_scores[kept], kept % classes + 1, of_region)
+
+    def _look_again(
+        self, features: dict[str, Tensor], chosen: list[Chosen], sizes: list[tuple[int, int]]
+    ) -> tuple[tuple[Tensor, ...], tuple[Tensor, ...]]:
+        """Of each image the cues (N, SECOND_LOOK) and features (N, F) that the box head has of boxes as proposals."""
+        heads = self.detector.roi_heads
+        labels = torch.cat([c.labels for c in chosen])
+        vectors = heads.box_head(heads.box_roi_pool(features, [c.boxes for c in chosen], sizes))
+        logits, deltas = heads.box_predictor(vectors)
+        each = torch.arange(len(labels), device=labels.device)
+        scores = torch.softmax(logits, -1)
+        cues = second_look(
+            deltas.view(len(labels), scores.shape[1], 4)[each, labels], scores[each, labels], scores[:, 0]
         )
+        counts = [len(c.boxes) for c in chosen]
+        return cues.split(counts), vectors.split(counts)
 
     def covariances(self, regions: Regions) -> Tensor:
         """(N, 4, 4) of the boxes of regions [px^2 of the network's input]."""
-        variances, couplings = self.covariance_head(regions.features, regions.geometries, regions.labels)
+        variances, couplings = self.covariance_head(regions.features, regions.cues, regions.labels)
         weights = self.detector.roi_heads.box_coder.weights
         return corner_covariances(variances, couplings, regions.proposals, regions.boxes, weights)
 

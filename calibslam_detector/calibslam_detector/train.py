@@ -29,7 +29,7 @@ from calibslam_detector.weights_file import WeightsError
 from calibslam_msgs_py.command import command
 from calibslam_msgs_py.settings import Settings, add_arguments, from_arguments, setting
 
-MIN_EXAMPLES = 64  # of the covariance head
+MIN_EXAMPLES = 500  # of the covariance head; a fifth of them are held out, and two sums of f-Cal need 50
 INTERRUPTED = 130  # exit code, as of a process that SIGINT ended
 
 

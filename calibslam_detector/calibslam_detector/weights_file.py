@@ -15,7 +15,7 @@ from torchvision.models.detection import (
 
 from calibslam_detector.network import ARCHITECTURES, CalibratedDetector
 
-FORMAT, VERSION = "calibslam_detector", 1
+FORMAT, VERSION = "calibslam_detector", 2
 # Architectures of which torchvision offers weights trained on COCO, and their classes, background first.
 COCO = {
     "mobilenet_v3_large_320_fpn": FasterRCNN_MobileNet_V3_Large_320_FPN_Weights.COCO_V1,

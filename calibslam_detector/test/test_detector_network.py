@@ -17,9 +17,10 @@ from calibslam_detector.box_covariance import (
     decoupled,
     rescaled,
 )
-from calibslam_detector.covariance_head import GEOMETRY, MAX_COUPLING, VARIANCE_BOUNDS, CovarianceHead, geometry
+from calibslam_detector.covariance_head import MAX_COUPLING, VARIANCE_BOUNDS, CovarianceHead
 from calibslam_detector.familiarity import Familiarity, descriptor
 from calibslam_detector.network import ARCHITECTURES, CalibratedDetector, freeze_norms
+from calibslam_detector.region_cues import CUES
 
 CODER = BoxCoder((10.0, 10.0, 5.0, 5.0))
 CLASSES = ("cup", "book", "chair")
@@ -125,7 +126,7 @@ def test_the_covariance_is_that_of_the_chosen_class_and_region(
     with torch.no_grad():
         found, results = network.regions(images), network.detect(images)
         for image, regions, result in zip(images, found, results, strict=True):
-            variances, couplings = network.covariance_head(regions.features, regions.geometries, regions.labels)
+            variances, couplings = network.covariance_head(regions.features, regions.cues, regions.labels)
             assert variances.std() > 0.0
             k = len(regions.labels) // 2
             J = decoder_jacobian(regions.proposals[k : k + 1], regions.boxes[k : k + 1], CODER.weights)[0]
@@ -137,22 +138,35 @@ def test_the_covariance_is_that_of_the_chosen_class_and_region(
 
 
 def test_the_head_stays_within_its_bounds_and_begins_alike_for_all() -> None:
-    head = CovarianceHead(8, 4)
+    head = CovarianceHead(8, 4).eval()
     features, labels = 100.0 * torch.randn(50, 8), torch.randint(0, 4, (50,))
-    variances, couplings = head(features, torch.zeros(50, GEOMETRY), labels)
+    variances, couplings = head(features, torch.zeros(50, CUES), labels)
     torch.testing.assert_close(variances, torch.full((50, 4), float(np.sqrt(np.prod(VARIANCE_BOUNDS)))))
     assert (couplings == 0.0).all()
     torch.nn.init.normal_(head.output.weight, 0.0, 100.0)
-    variances, couplings = head(features, torch.zeros(50, GEOMETRY), labels)
+    variances, couplings = head(features, torch.zeros(50, CUES), labels)
     assert (variances >= VARIANCE_BOUNDS[0] * 0.999).all() and (variances <= VARIANCE_BOUNDS[1] * 1.001).all()
     assert (couplings.abs() <= MAX_COUPLING).all()
 
 
-def test_geometry_tells_size_and_borders() -> None:
-    box = torch.tensor([[0.0, 30.0, 40.0, 60.0]])
-    numbers = geometry(box, torch.tensor([0.5]), (100, 100))[0].tolist()
-    expected = [np.log(0.4), np.log(0.3), 1.0, np.exp(-30 / 1.5), np.exp(-60 / 2.0), np.exp(-40 / 1.5), 0.0]
-    assert numbers == pytest.approx(expected, abs=1e-6)
+def test_what_is_said_of_a_box_does_not_depend_on_the_threshold(
+    network: CalibratedDetector, images: list[torch.Tensor]
+) -> None:
+    """A box that hides another one may itself be below the threshold."""
+    heads = network.detector.roi_heads
+    threshold = heads.score_thresh
+    with torch.no_grad():
+        every = network.regions(images[:1])[0]
+        try:
+            heads.score_thresh = float(every.scores.median())
+            some = network.regions(images[:1])[0]
+        finally:
+            heads.score_thresh = threshold
+    n = len(some.boxes)
+    assert 0 < n < len(every.boxes)
+    for name in ("boxes", "labels", "scores", "features"):
+        assert torch.equal(getattr(some, name), getattr(every, name)[:n]), name
+    torch.testing.assert_close(some.cues, every.cues[:n], rtol=1e-4, atol=1e-4)
 
 
 def test_images_unlike_those_known_are_strange() -> None:

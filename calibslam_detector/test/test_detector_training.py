@@ -19,6 +19,7 @@ from calibslam_detector import evaluate_detector, train, weights_file
 from calibslam_detector.coco_data import DataError, TrainingImages, load_coco_data
 from calibslam_detector.covariance_task import LOSSES, Examples, covariance_task
 from calibslam_detector.network import CalibratedDetector
+from calibslam_detector.region_cues import CUES
 from calibslam_detector.training_loop import LoopSettings, Task, TrainingError, batch_of, optimise
 from calibslam_detector.weights_file import WeightsError
 
@@ -259,7 +260,7 @@ def examples(count: int) -> tuple[Examples, torch.Tensor]:
     residuals = sigma * torch.randn(count, 4, generator=generator)
     labels = torch.randint(1, 3, (count,), generator=generator)
     return Examples(
-        features, torch.zeros(count, 7), labels, residuals, torch.ones(count, dtype=torch.bool), torch.zeros(1, 128)
+        features, torch.zeros(count, CUES), labels, residuals, torch.ones(count, dtype=torch.bool), torch.zeros(1, 128)
     ), sigma
 
 
@@ -272,7 +273,7 @@ def test_the_head_learns_true_variances(loss: str, tmp_path: Path) -> None:
     settings = LoopSettings(steps=150, learning_rate=3e-3, warm_up=0, log_every=50)
     optimise(covariance_task(model, learnt, loss, 512, settings, torch.device("cpu")), settings, tmp_path, {}, False)
     with torch.no_grad():
-        variances, _ = model.covariance_head(learnt.features, learnt.geometries, learnt.labels)
+        variances, _ = model.covariance_head.eval()(learnt.features, learnt.cues, learnt.labels)
     ratio = torch.log(variances.sqrt() / sigma)
     # sigma varies by a factor of e^0.5 about its mean; learnt, a good part of that is explained.
     assert ratio.std() < 0.4

@@ -18,6 +18,7 @@ from torch import Tensor, nn
 from calibslam_detector.calibration import metrics
 from calibslam_detector.calibration.epistemic import ensemble, monte_carlo_dropout
 from calibslam_detector.calibration.f_cal import FCal
+from calibslam_detector.calibration.f_cal_cramer import FCalCramer
 from calibslam_detector.calibration.losses import Blend, CalibrationLoss, GaussianNLL
 from calibslam_detector.calibration.recalibration import IsotonicRecalibration, TemperatureScaling
 from calibslam_detector.regressions.network import DROPOUT, Regressor, fine_tune, train
@@ -42,8 +43,10 @@ class RegressionSettings(Settings):
 
     degrees: int = setting(50, "K, degrees of freedom of f-Cal's sums", low=2)
     sums: int = setting(200, "H, sums that f-Cal draws", low=2)
-    weight: float = setting(0.5, "lambda of f-Cal with KL", low=0.0, high=1.0)
-    batch: int = setting(200, "samples from which f-Cal draws its sums", low=2)
+    weight: float = setting(
+        0.5, "lambda of f-Cal with KL, and with the distance of Cramer and von Mises", low=0.0, high=1.0
+    )
+    batch: int = setting(1000, "held-out samples in a step of fine-tuning", low=2)
     steps: int = setting(300, "of fine-tuning the variances", low=1)
     size: float = setting(1.0, "factor on the numbers of samples", low=0.05)
     effort: float = setting(1.0, "factor on the number of epochs", low=0.05)
@@ -139,6 +142,11 @@ def _f_cal_wasserstein_published(case: Case) -> Prediction:
     return predicted(case.fine_tune(loss), case.test)
 
 
+def _f_cal_cramer(case: Case) -> Prediction:
+    distance = FCalCramer((1, case.settings.degrees), generator=torch.Generator().manual_seed(case.seed))
+    return predicted(case.fine_tune(Blend(GaussianNLL(), distance, case.settings.weight)), case.test)
+
+
 def _f_cal_end_to_end(case: Case) -> Prediction:
     return predicted(case.train(f_cal(case, "kl", END_TO_END_WEIGHT)), case.test)
 
@@ -183,6 +191,7 @@ METHODS: dict[str, Callable[[Case], Prediction]] = {
     "f_cal_kl": _f_cal_kl,
     "f_cal_wasserstein": _f_cal_wasserstein,
     "f_cal_wasserstein_published": _f_cal_wasserstein_published,
+    "f_cal_cramer": _f_cal_cramer,
     "f_cal_end_to_end": _f_cal_end_to_end,
     "nll_fine_tuned": _nll_fine_tuned,
     "nll_all_samples": _nll_all_samples,
