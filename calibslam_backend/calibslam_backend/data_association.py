@@ -253,10 +253,9 @@ class DataAssociation:
         """The quadric that this one is, if the map has it."""
         if self.settings.association == GIVEN:
             return None
-        ids = list(self._graph.landmarks)
+        ids, vectors = self._graph.quadrics()
         if not ids:
             return None
-        vectors = np.stack([self._graph.quadric(j) for j in ids])
         same = same_object(vector, vectors, self.settings.merge_distance)
         for n in np.argsort(np.linalg.norm(vectors[:, :3] - vector[:3], axis=1)):
             j = ids[n]

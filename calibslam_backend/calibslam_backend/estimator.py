@@ -82,7 +82,7 @@ class Estimator:
     START_ERROR = 1.0  # [rad, m] of a start pose that is given
     NIS_EVERY = 10  # keyframes, since it takes about as long as half an update's votes
     # At the end: rounds of association and optimisation, and when poses [rad, m] count as settled.
-    ROUNDS, ITERATIONS_OF_A_ROUND, ITERATIONS, CONVERGED = 5, 2, 10, 1e-3
+    ROUNDS, ITERATIONS_OF_A_ROUND, ITERATIONS, CONVERGED = 5, 2, 10, 5e-3
 
     def __init__(self, camera: Camera, T_body_camera: Array, settings: EstimatorSettings) -> None:
         load_kernels()

@@ -149,6 +149,12 @@ class ObjectGraph:
         """(9,) centre and logarithmic shape."""
         return np.asarray(self._smoother.values.atVector(_q(j)))
 
+    def quadrics(self) -> tuple[list[int], Array]:
+        """Ids of all quadrics, in their order, and (M, 9) vectors."""
+        ids = sorted(self.landmarks)
+        rows = np.reshape(gtsam.utilities.extractVectors(self._smoother.values, "q"), (-1, 9))
+        return ids, np.ascontiguousarray(rows)  # GTSAM's are by columns
+
     def is_solved(self, j: int) -> bool:
         """Whether a quadric has gone through an update, and so has covariances."""
         return self._smoother.has(("prior", j))
@@ -313,8 +319,8 @@ class ObjectGraph:
         for k in turn:
             if moved[k]:
                 names["motion", k] = names["motion", k + 1] = None
-        for j, landmark in self.landmarks.items():
-            vector = self.quadric(j)
+        for j, vector in zip(*self.quadrics(), strict=True):
+            landmark = self.landmarks[j]
             young = self.size - landmark.born <= s.young
             for k in landmark.boxes if young else [k for k in turn if k in landmark.boxes]:
                 if moved[k] or np.abs(vector - landmark.linearised[k]).max() > s.relinearise_quadric:
@@ -329,10 +335,9 @@ class ObjectGraph:
 
     def _ran_away(self) -> list[int]:
         """Quadrics that are no objects any more."""
-        ids = list(self.landmarks)
+        ids, vectors = self.quadrics()
         if not ids:
             return []
-        vectors = np.stack([self.quadric(j) for j in ids])
         finite = np.isfinite(vectors).all(axis=1)
         vectors[~finite] = 0.0
         radii = np.exp(np.linalg.eigvalsh(matrix_from_vector(vectors[:, 3:])))

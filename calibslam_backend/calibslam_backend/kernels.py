@@ -12,9 +12,11 @@ from calibslam_backend.box_factor import box_factor
 from calibslam_backend.box_measurement import BoxMeasurement
 from calibslam_backend.initialisation import InitialisationSettings, initialise
 from calibslam_backend.localisation import localise
-from calibslam_backend.quadric import ALL_EDGES, Ellipsoid, box_of_visible_part
+from calibslam_backend.quadric import ALL_EDGES, Ellipsoid, box_of_visible_part, shapes
 from calibslam_backend.relocalisation import overlaps_at
 from calibslam_backend.revision import squared_distances
+from calibslam_backend.robust import robust_scales
+from calibslam_backend.tracking import overlap
 
 
 @functools.cache
@@ -27,6 +29,7 @@ def load_kernels() -> None:
     boxes = []
     for pose in poses:
         _, corners, _ = box_of_visible_part(pose.matrix(), vector, K, bounds, ALL_EDGES)
+        box_of_visible_part(np.ascontiguousarray(pose.matrix()), vector, K, bounds, ALL_EDGES)  # rows, not columns
         boxes.append(BoxMeasurement(corners, np.eye(4), bounds, ~ALL_EDGES))
     values = gtsam.Values()
     values.insert(0, poses[0])
@@ -34,11 +37,12 @@ def load_kernels() -> None:
     box_factor(0, 1, boxes[0], K, 1.0).linearize(values)
     initialise(np.stack([pose.matrix() for pose in poses]), boxes, K, 1.0, InitialisationSettings())
     everything = np.ones((1, 1), np.bool_)
-    overlaps_at(
-        np.eye(4), vector[None, :3].copy(), np.eye(3)[None], K, bounds[2:].copy(), bounds[None].copy(), everything
-    )
+    surfaces = shapes(vector[None])
+    overlap(bounds[None], bounds[None])
+    overlaps_at(np.eye(4), vector[None, :3].copy(), surfaces, K, bounds[2:].copy(), bounds[None].copy(), everything)
+    robust_scales(1.0, 1.0)
     squared_distances(
-        np.eye(4), vector[None], np.eye(3)[None], K, bounds[2:].copy(), bounds[None].copy(), np.eye(4)[None],
+        np.eye(4), vector[None], surfaces, K, bounds[2:].copy(), bounds[None].copy(), np.eye(4)[None],
         bounds[None].copy(), ~ALL_EDGES[None], 0.1
     )  # fmt: skip
     localise(poses[0].matrix(), np.eye(6), [values.atVector(1)], boxes[:1], K, 1.0, 1.0)

@@ -106,10 +106,12 @@ class Revision:
         cost = squared_distances(T, self._quadrics, self._shapes, self._K, self._image, *boxes, settings.model_error)
         cost += np.reshape([self._class_cost(class_id) for class_id in classes], cost.T.shape).T
         gate = gate_of(settings.gate)
-        fits = np.minimum(cost - gate, 0.0)
+        fits: list[dict[int, float]] = [{} for _ in tracks]
+        for m, n in np.argwhere(cost < gate).tolist():
+            fits[n][self._ids[m]] = float(cost[m, n]) - gate
+        cost += 0.5 * COHERENCE
         for n, track in enumerate(tracks):
-            track.learn(k, {self._ids[m]: float(fits[m, n]) for m in np.flatnonzero(fits[:, n]).tolist()})
-            cost[:, n] += 0.5 * COHERENCE
+            track.learn(k, fits[n])
             for j, share in track.shares(k).items():
                 if j in self._row:
                     cost[self._row[j], n] -= COHERENCE * share

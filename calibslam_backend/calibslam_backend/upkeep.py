@@ -42,11 +42,11 @@ class Upkeep:
         """
         if self._settings.association == GIVEN:
             return 0
-        ids = list(self._graph.landmarks)
+        ids, vectors = self._graph.quadrics()
         if not ids:
             return 0
         revision = Revision(
-            np.stack([self._graph.quadric(j) for j in ids]),
+            vectors,
             ids,
             [self._assignments.classes[j] for j in ids],
             self._camera.K,
@@ -97,10 +97,9 @@ class Upkeep:
             if j in landmarks and known in landmarks and not self._assignments.seen_beside(j, known):
                 self._unite(j, known)
         self._assignments.same.clear()
-        ids = sorted(landmarks)
+        ids, vectors = self._graph.quadrics()
         if not ids:
             return
-        vectors = np.stack([self._graph.quadric(j) for j in ids])
         pairs = vectors[:, None], vectors[None]
         # An older quadric of its place, size and class, never seen beside it, is the same object; even one seen beside
         # it, if both have settled at one place.
