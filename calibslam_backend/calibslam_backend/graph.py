@@ -11,14 +11,14 @@ from __future__ import annotations
 
 import functools
 import logging
-from collections.abc import Callable, Hashable
+from collections.abc import Callable, Hashable, Iterable
 from dataclasses import dataclass, field
 
 import gtsam
 import numpy as np
 from gtsam import symbol
 
-from calibslam_backend.box_factor import box_factor
+from calibslam_backend.box_factor import box_factor, box_tangents
 from calibslam_backend.box_measurement import BoxMeasurement
 from calibslam_backend.initialisation import InitialisationSettings
 from calibslam_backend.odometry import MotionNoise, dead_reckoning
@@ -112,7 +112,8 @@ class ObjectGraph:
         self._motions: list[Motion] = []
         self.landmarks: dict[int, Landmark] = {}
         self._origin, self._origin_sigma = T_MAP_FIRST_CAMERA, settings.prior_sigma
-        self._smoother = Smoother({"x": (6, self.FAR), "q": (9, np.inf), "d": (DRIFT, np.inf)})
+        thresholds = {"x": (6, self.FAR), "q": (9, np.inf), "d": (DRIFT, np.inf)}
+        self._smoother = Smoother(thresholds, self._linearise_boxes)
         self._linearised: list[Array] = []  # (4, 4) of each pose where its factors were linearised
         self._next_turn = 0
 
@@ -151,8 +152,13 @@ class ObjectGraph:
 
     def quadrics(self) -> tuple[list[int], Array]:
         """Ids of all quadrics, in their order, and (M, 9) vectors."""
+        return self._quadrics(self._smoother.values)
+
+    def _quadrics(self, values: gtsam.Values) -> tuple[list[int], Array]:
         ids = sorted(self.landmarks)
-        rows = np.reshape(gtsam.utilities.extractVectors(self._smoother.values, "q"), (-1, 9))
+        rows = np.reshape(gtsam.utilities.extractVectors(values, "q"), (-1, 9))
+        if len(rows) != len(ids):
+            raise RuntimeError(f"{len(rows)} quadrics in the tree, {len(ids)} in the graph")
         return ids, np.ascontiguousarray(rows)  # GTSAM's are by columns
 
     def is_solved(self, j: int) -> bool:
@@ -295,6 +301,21 @@ class ObjectGraph:
         self._linearised = list(_poses(values))
         for j, landmark in self.landmarks.items():
             landmark.linearised = dict.fromkeys(landmark.boxes, values.atVector(_q(j)))
+
+    def _linearise_boxes(self, names: Iterable[Hashable], values: gtsam.Values) -> dict[Hashable, gtsam.JacobianFactor]:
+        """The tangents of those of these factors that are boxes."""
+        ids, vectors = self._quadrics(values)
+        rows = {j: row for row, j in enumerate(ids)}
+        boxes = [name for name in names if isinstance(name, tuple) and name[0] == "box"]
+        tangents = box_tangents(
+            [(_x(k), _q(j)) for _, k, j in boxes],
+            _poses(values)[[k for _, k, _ in boxes]],
+            vectors[[rows[j] for _, _, j in boxes]],
+            [self.landmarks[j].boxes[k] for _, k, j in boxes],
+            self._K,
+            self._settings.robust_scale,
+        )
+        return dict(zip(boxes, tangents, strict=True))
 
     def _last(self) -> list[int]:
         """Quadrics, the drift and the newest pose are eliminated last: the next update will touch them again."""

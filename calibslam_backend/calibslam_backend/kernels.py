@@ -8,7 +8,7 @@ import gc
 import gtsam
 import numpy as np
 
-from calibslam_backend.box_factor import box_factor
+from calibslam_backend.box_factor import box_factor, box_tangents
 from calibslam_backend.box_measurement import BoxMeasurement
 from calibslam_backend.initialisation import InitialisationSettings, initialise
 from calibslam_backend.localisation import localise
@@ -35,6 +35,7 @@ def load_kernels() -> None:
     values.insert(0, poses[0])
     values.insert(1, vector)
     box_factor(0, 1, boxes[0], K, 1.0).linearize(values)
+    box_tangents([(0, 1)], np.eye(4)[None], vector[None], boxes[:1], K, 1.0)
     initialise(np.stack([pose.matrix() for pose in poses]), boxes, K, 1.0, InitialisationSettings())
     everything = np.ones((1, 1), np.bool_)
     surfaces = shapes(vector[None])

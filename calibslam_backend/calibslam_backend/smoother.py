@@ -13,7 +13,7 @@ gone far, since the tangent of a rotation is that of a vector space only nearby.
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Iterable
+from collections.abc import Callable, Hashable, Iterable
 
 import gtsam
 import numpy as np
@@ -21,6 +21,7 @@ import numpy as np
 from calibslam_msgs_py.measurements import Array
 
 Name = Hashable
+Linearise = Callable[[Iterable[Name], gtsam.Values], dict[Name, gtsam.JacobianFactor]]
 
 
 class Smoother:
@@ -32,9 +33,15 @@ class Smoother:
     BATCH_ITERATIONS = 100
     CONVERGED = 1e-5  # share by which an iteration of the batch optimiser has to lower the error
 
-    def __init__(self, thresholds: dict[str, tuple[int, float]]) -> None:
-        """`thresholds`: for each letter of keys the dimension of its variables and the change that moves their base."""
+    def __init__(self, thresholds: dict[str, tuple[int, float]], linearise: Linearise | None = None) -> None:
+        """A smoother of nothing.
+
+        Args:
+            thresholds: for each letter of keys the dimension of its variables and the change that moves their base.
+            linearise: the tangents of some factors, by name, at these values, where that is faster than one by one.
+        """
         self._thresholds = thresholds
+        self._linearise = linearise
         self.values = gtsam.Values()
         self._factors: dict[Name, gtsam.NonlinearFactor] = {}
         self._slots: dict[Name, int] = {}  # of the factors in the tree
@@ -166,10 +173,11 @@ class Smoother:
         self._new_values = gtsam.Values()
         self._to_remove = []
 
-    def _tangents(self, names: Iterable[Name]) -> gtsam.NonlinearFactorGraph:
+    def _tangents(self, names: list[Name]) -> gtsam.NonlinearFactorGraph:
         graph = gtsam.NonlinearFactorGraph()
+        known = self._linearise(names, self.values) if self._linearise else {}
         for name in names:
-            tangent = self._factors[name].linearize(self.values)
+            tangent = known.get(name) or self._factors[name].linearize(self.values)
             graph.push_back(gtsam.LinearContainerFactor(tangent, self.values))
         return graph
 

@@ -68,7 +68,7 @@ class World:
 def test_an_object_that_was_begun_twice_is_one() -> None:
     """A track was lost and found, 2 cm off: the second quadric fits its boxes best, the first nearly as well.
 
-    5 px of 2 px and a fifth of the 30 px that the box is wide: d^2 = 1.2, six times, is less than 9 log 6.
+    5 px of 2 px and a fifth of the 30 px that the box is wide: d^2 = 1.2, six times, is far less than 4 * 9 log 6.
     """
     world = World()
     moved = (-0.28, 0.0, 2.0)
@@ -138,6 +138,19 @@ def test_relocalisation_does_not_unite_what_was_seen_side_by_side(together: bool
     assert len(world.graph.landmarks) == (2 if together else 1)
     assert world.counts["merged"] == (0 if together else 1)
     assert world.books.same == []
+
+
+def test_three_that_are_one_become_the_oldest() -> None:
+    world = World()
+    ids = [world.books.begin(world.cup((-0.3 + 0.005 * n, 0.0, 2.0))) for n in range(3)]
+    for k in range(FRAMES):
+        world.show((LEFT, k // 4))
+    for track, j in enumerate(ids):
+        world.books.bind(track, j)
+    world.upkeep.merge()
+    assert list(world.graph.landmarks) == ids[:1]
+    assert world.keyframes(ids[0]) == list(range(FRAMES))
+    assert world.counts["merged"] == 2
 
 
 def test_given_identities_are_left_alone() -> None:
