@@ -20,7 +20,7 @@ class Upkeep:
     UNSETTLED = 10  # newest keyframes, whose boxes are not judged anew yet
     LEAST_BOXES = 3  # fewer do not determine a quadric
     NUMBERS = 9  # that a quadric is made of
-    # Boxes of neighbouring keyframes err alike: with a correlation of 0.6, as on fr3_office, so many say as much as one.
+    # Boxes of neighbouring keyframes err alike: with a correlation of 0.6 (fr3_office) so many say as much as one.
     ALIKE = 4.0
 
     def __init__(

@@ -110,18 +110,18 @@ def test_a_quadric_that_was_not_judged_yet_is_not_dropped() -> None:
     assert sorted(world.graph.landmarks) == ids
 
 
-def test_a_box_of_a_track_that_slipped_changes_hands() -> None:
-    """The track went on with the neighbour when its object was lost from sight; its quadric kept the boxes."""
+def test_boxes_of_a_track_that_slipped_change_hands() -> None:
+    """The left one is lost from sight, and its track goes on with the right one, whose own track has ended."""
     world = World()
-    left, right = (world.books.begin(world.cup(place)) for place in (LEFT, RIGHT))
+    ids = [world.books.begin(world.cup(place)) for place in (LEFT, RIGHT)]
     for k in range(FRAMES):
-        world.show((LEFT if k < 6 else RIGHT, 0))
-    world.books.bind(0, left)
-    for _ in range(3):  # so that the other quadric has boxes, too, and stays
-        world.books.frames.append(Frame([], [], (), (), []))
+        world.show(*([(LEFT, 0), (RIGHT, 1)] if k < 6 else [(RIGHT, 0)]))
+    for track, j in enumerate(ids):
+        world.books.bind(track, j)
+    assert world.keyframes(ids[0]) == list(range(FRAMES))
     assert world.upkeep.revise() == 6
-    assert world.keyframes(left) == list(range(6))
-    assert world.keyframes(right) == list(range(6, FRAMES))
+    assert world.keyframes(ids[0]) == list(range(6))
+    assert world.keyframes(ids[1]) == list(range(FRAMES))
 
 
 @pytest.mark.parametrize("together", [True, False])
