@@ -20,7 +20,7 @@ from std_srvs.srv import SetBool, Trigger
 
 from calibslam_backend.metrics import ate
 from calibslam_msgs_py.conversions import RosTypes, boxes_to_msg, camera_to_msg, motion_to_msg
-from calibslam_msgs_py.measurements import Boxes, RelativeMotion
+from calibslam_msgs_py.measurements import SECOND, Boxes, Camera, RelativeMotion
 from calibslam_msgs_py.node import LATCHED, MEASUREMENT
 
 WORLD = SmallWorld(around(150), objects())
@@ -40,8 +40,8 @@ class Robot:
         for publisher in (self._camera, self._boxes, self._motions):
             wait_until(lambda p=publisher: p.get_subscription_count() == 1, "the back end does not subscribe")
 
-    def camera(self) -> None:
-        self._camera.publish(camera_to_msg(CAMERA, 0, TYPES))
+    def camera(self, stamp: int = 0, camera: Camera = CAMERA) -> None:
+        self._camera.publish(camera_to_msg(camera, stamp, TYPES))
 
     def boxes(self, boxes: Boxes, spoil: Callable[[Any], None] | None = None) -> None:
         message = boxes_to_msg(boxes, TYPES)
@@ -177,6 +177,27 @@ def test_measurements_wait_for_the_camera(robot: Robot) -> None:
     robot.drive(0, 40)
     robot.camera()
     robot.expect(images=40, motions=39)
+
+
+def test_another_camera(robot: Robot) -> None:
+    """The first one stays, whatever comes between; after a reset it is the newest."""
+    other = replace(CAMERA, K=np.diag([1.1, 1.1, 1.0]) @ CAMERA.K)
+    robot.camera()
+    robot.drive(0, 10)
+    robot.expect(images=10)
+    robot.camera(stamp=SECOND)
+    for changes in (1, 2):
+        robot.camera(2 * SECOND, other)
+        robot.expect(rejected_camera_changed=changes)
+        robot.camera(3 * SECOND)
+    robot.drive(10, 20)
+    robot.expect(rejected_camera_changed=2, images=20)
+    robot.camera(4 * SECOND, other)
+    robot.expect(rejected_camera_changed=3)
+    assert robot.watcher.call(Trigger, "/backend/reset").success
+    robot.camera(5 * SECOND, other)
+    robot.camera(6 * SECOND)
+    robot.expect(rejected_camera_changed=4)
 
 
 def test_pause_reset_save_and_load(robot: Robot, tmp_path: Path) -> None:
