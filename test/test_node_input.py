@@ -39,6 +39,7 @@ class Robot:
         watcher.listen(PathMessage, "/trajectory")
         for publisher in (self._camera, self._boxes, self._motions):
             wait_until(lambda p=publisher: p.get_subscription_count() == 1, "the back end does not subscribe")
+        time.sleep(0.5)  # that one side has found the other does not tell that the other has
 
     def camera(self, stamp: int = 0, camera: Camera = CAMERA) -> None:
         self._camera.publish(camera_to_msg(camera, stamp, TYPES))
