@@ -13,7 +13,7 @@ from calibslam_backend.box_measurement import BoxMeasurement
 from calibslam_backend.initialisation import InitialisationSettings, initialise
 from calibslam_backend.localisation import localise
 from calibslam_backend.quadric import ALL_EDGES, Ellipsoid, box_of_visible_part, shapes
-from calibslam_backend.relocalisation import overlaps_at
+from calibslam_backend.relocalisation import overlaps_at, scores_at
 from calibslam_backend.revision import squared_distances
 from calibslam_backend.robust import robust_scales
 from calibslam_backend.tracking import overlap
@@ -40,7 +40,9 @@ def load_kernels() -> None:
     everything = np.ones((1, 1), np.bool_)
     surfaces = shapes(vector[None])
     overlap(bounds[None], bounds[None])
-    overlaps_at(np.eye(4), vector[None, :3].copy(), surfaces, K, bounds[2:].copy(), bounds[None].copy(), everything)
+    view = vector[None, :3].copy(), surfaces, K, bounds[2:].copy(), bounds[None].copy(), everything
+    overlaps_at(np.eye(4), *view)
+    scores_at(np.eye(4)[None], *view)
     robust_scales(1.0, 1.0)
     squared_distances(
         np.eye(4), vector[None], surfaces, K, bounds[2:].copy(), bounds[None].copy(), np.eye(4)[None],

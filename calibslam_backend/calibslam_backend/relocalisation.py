@@ -92,8 +92,11 @@ def relocalise(
     def explained(T: Array) -> list[tuple[int, int]]:
         return _one_to_one(overlaps(T), settings.relocalisation_overlap)
 
-    def score(T: Array) -> float:
-        return float(overlaps(T).max(axis=1).sum())
+    def best_of(hypotheses: list[Array]) -> list[Array]:
+        if not hypotheses:
+            return []
+        scores = scores_at(np.stack(hypotheses), centres, surfaces, K, size, corners, compatible)
+        return [hypotheses[n] for n in np.argsort(-scores, kind="stable")[:REFINED]]
 
     needed = max(settings.relocalisation_boxes, math.ceil(FOUND_SHARE * len(boxes)))
     if predicted is not None:
@@ -104,7 +107,7 @@ def relocalise(
     best: Relocalised | None = None
     near = [] if predicted is None else _by_one(predicted, points, quadrics, compatible)
     for hypotheses in (near, _by_three(points, quadrics, compatible)):
-        for T in sorted(hypotheses, key=score, reverse=True)[:REFINED]:
+        for T in best_of(hypotheses):
             pairs = explained(T)
             for _ in range(2):  # better poses explain more boxes, which make better poses
                 if len(pairs) < PROMISING:
@@ -221,3 +224,14 @@ def overlaps_at(T, centres, surfaces, K, size, corners, compatible):  # type: ig
                 own = (corners[n, 2] - corners[n, 0]) * (corners[n, 3] - corners[n, 1])
                 result[n, m] = shared / (own + (right - left) * (bottom - top) - shared)
     return result
+
+
+@numba.njit(cache=True)
+def scores_at(poses, centres, surfaces, K, size, corners, compatible):  # type: ignore[no-untyped-def]
+    """(H,) how well H poses (H, 4, 4) explain the boxes: sum of the best overlap of each, see `overlaps_at`."""
+    scores = np.zeros(len(poses))
+    for h in range(len(poses)):
+        overlaps = overlaps_at(poses[h], centres, surfaces, K, size, corners, compatible)
+        for n in range(len(corners)):
+            scores[h] += overlaps[n].max()
+    return scores
