@@ -136,6 +136,7 @@ def squared_distances(T, quadrics, surfaces, K, size, corners, covariances, boun
     The covariance is that of the measurement and that of the ellipsoid as a model of the object.
     """
     result = np.full((len(quadrics), len(corners)), np.inf)
+    S = np.empty((4, 4))
     compatible = np.ones((len(corners), len(quadrics)), np.bool_)
     overlaps = overlaps_at(T, quadrics[:, :3].copy(), surfaces, K, size, corners, compatible)
     for m in range(len(quadrics)):
@@ -145,9 +146,25 @@ def squared_distances(T, quadrics, surfaces, K, size, corners, covariances, boun
             visible, box, _ = box_of_visible_part(T, quadrics[m], K, bounds[n], clip[n])
             if not visible:
                 continue
-            S = covariances[n].copy()
+            S[:] = covariances[n]
             for edge in range(4):
                 S[edge, edge] += (model_error * (box[edge % 2 + 2] - box[edge % 2])) ** 2
-            difference = box - corners[n]
-            result[m, n] = difference @ np.linalg.solve(S, difference)
+            result[m, n] = _squared_distance(S, box - corners[n])
     return result
+
+
+@numba.njit(cache=True)
+def _squared_distance(S, e):  # type: ignore[no-untyped-def]
+    """e^T S^-1 e = |L^-1 e|^2 with S = L L^T. S and e are overwritten."""
+    q = 0.0
+    for i in range(len(e)):
+        for j in range(i):
+            for k in range(j):
+                S[i, j] -= S[i, k] * S[j, k]
+            S[i, j] /= S[j, j]
+            S[i, i] -= S[i, j] * S[i, j]
+            e[i] -= S[i, j] * e[j]
+        S[i, i] = np.sqrt(S[i, i])
+        e[i] /= S[i, i]
+        q += e[i] * e[i]
+    return q
