@@ -24,7 +24,7 @@ from calibslam_msgs_py.command import command
 from calibslam_msgs_py.measurements import SECOND, Boxes, InvalidMeasurement
 from calibslam_msgs_py.settings import SettingsError, add_arguments, from_arguments
 
-MAP_PERIOD = 3.0  # [s] of recorded time between two maps in run.mcap
+MAP_PERIOD = 5.0  # [s] of recorded time between two maps in run.mcap
 
 
 @command
