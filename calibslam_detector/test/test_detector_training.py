@@ -270,14 +270,14 @@ def test_the_head_learns_true_variances(loss: str, tmp_path: Path) -> None:
     model = CalibratedDetector("compact", ("cup", "book"))
     before = {name: value.clone() for name, value in model.detector.state_dict().items()}
     learnt, sigma = examples(4000)
-    settings = LoopSettings(steps=150, learning_rate=3e-3, warm_up=0, log_every=50)
+    settings = LoopSettings(steps=400, learning_rate=3e-3, warm_up=0, log_every=50)
     optimise(covariance_task(model, learnt, loss, 512, settings, torch.device("cpu")), settings, tmp_path, {}, False)
     with torch.no_grad():
         variances, _ = model.covariance_head.eval()(learnt.features, learnt.cues, learnt.labels)
     ratio = torch.log(variances.sqrt() / sigma)
     # sigma varies by a factor of e^0.5 about its mean; learnt, a good part of that is explained.
     assert ratio.std() < 0.4
-    assert abs(ratio.mean()) < (0.5 if loss == "calibration" else 0.15)
+    assert abs(ratio.mean()) < (0.5 if loss == "calibration" else 0.2)
     for name, value in model.detector.state_dict().items():
         assert torch.equal(value, before[name]), name
 
