@@ -40,8 +40,8 @@ class Frame:
     @functools.cached_property
     def arrays(self) -> list[Array]:
         """(N, ...) corners, covariances, bounds and clip of the boxes."""
-        corners, whiteners, bounds, clip = stacked(self.boxes)
-        return [corners, np.linalg.inv(whiteners.transpose(0, 2, 1) @ whiteners), bounds, clip]
+        corners, _, bounds, clip = stacked(self.boxes)
+        return [corners, np.stack([box.covariance for box in self.boxes]), bounds, clip]
 
 
 @dataclass
@@ -79,6 +79,9 @@ class Assignments:
         known: quadrics of a loaded map.
         same: pairs (quadric, older one) that were found to be one object, to be united.
     """
+
+    # Keyframes after which a quadric has settled; before, it may turn out to be one that was known already.
+    YOUNG = 30
 
     def __init__(self, graph: ObjectGraph) -> None:
         self.graph = graph

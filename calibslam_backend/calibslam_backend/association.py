@@ -131,11 +131,10 @@ def distances(
     gate = gate_of(settings.gate)
     result = np.full((len(predictions), len(boxes)), np.inf)
     for b, box in enumerate(boxes):
-        measured = np.linalg.inv(box.whitener.T @ box.whitener)
         for p, prediction in enumerate(predictions):
             if overlap(prediction.corners[None], box.corners[None])[0, 0] < settings.min_overlap:
                 continue
-            S = prediction.covariance + measured
+            S = prediction.covariance + box.covariance
             difference = box.corners - prediction.corners
             squared = difference @ np.linalg.solve(S, difference)
             if squared < gate:

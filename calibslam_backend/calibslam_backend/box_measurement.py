@@ -34,6 +34,11 @@ class BoxMeasurement:
     clip: NDArray[np.bool_]
 
     @functools.cached_property
+    def covariance(self) -> Array:
+        """(4, 4) of the corners [px^2]."""
+        return np.asarray(np.linalg.inv(self.whitener.T @ self.whitener))
+
+    @functools.cached_property
     def packed(self) -> Array:
         """(7, 4) rows: corners, bounds, clip, whitener. For compiled code: one array instead of four."""
         return np.vstack([self.corners, self.bounds, self.clip, self.whitener])

@@ -47,7 +47,6 @@ class DataAssociation:
     # A bound track whose boxes miss their quadric so often in a row has slipped to another object.
     MAX_MISFITS = 3
     LEAST_FIT = 0.1  # overlap of a box with its quadric's that is no misfit
-    YOUNG = 30  # keyframes during which a quadric may turn out to be one that was known before
     # Standard deviations that a camera can be from where it is thought to be. They are too small on real data, by a
     # factor of about four; rows of like objects, seen from the other side of the room, are 70 and more away.
     FARTHEST = 20.0
@@ -183,7 +182,11 @@ class DataAssociation:
         if self.settings.association == GIVEN or not any(self._is_recent(t) for t in frame.tracks):
             return
         # A young quadric is what is in question: it may be an old one, seen from where the camera is not.
-        old = [j for j in self._graph.landmarks if self._graph.is_solved(j) and self._assignments.age(j) > self.YOUNG]
+        old = [
+            j
+            for j in self._graph.landmarks
+            if self._graph.is_solved(j) and self._assignments.age(j) > self._assignments.YOUNG
+        ]
         found = self._relocalised(frame, k, old)
         if found is None:
             return
@@ -199,7 +202,7 @@ class DataAssociation:
     def _is_recent(self, track: int) -> bool:
         """Whether a track is open, or bound to a young quadric."""
         quadric = self._assignments.tracks[track].quadric
-        return quadric is None or self._assignments.age(quadric) <= self.YOUNG
+        return quadric is None or self._assignments.age(quadric) <= self._assignments.YOUNG
 
     def _relocalised(self, frame: Frame, k: int | None, known: list[int]) -> Relocalised | None:
         """A better pose of keyframe k by these quadrics, or, if it is None, a pose of which nothing is known.

@@ -37,6 +37,6 @@ def innovations(
             continue
         corners, uncertainty = prediction
         difference = box.corners - corners
-        S = uncertainty + np.linalg.inv(box.whitener.T @ box.whitener)
+        S = uncertainty + box.covariance
         result.append(difference @ np.linalg.solve(S, difference) / 4.0)
     return np.array(result)

@@ -149,22 +149,6 @@ def squared_distances(T, quadrics, surfaces, K, size, corners, covariances, boun
             S[:] = covariances[n]
             for edge in range(4):
                 S[edge, edge] += (model_error * (box[edge % 2 + 2] - box[edge % 2])) ** 2
-            result[m, n] = _squared_distance(S, box - corners[n])
+            difference = box - corners[n]
+            result[m, n] = difference @ np.linalg.solve(S, difference)
     return result
-
-
-@numba.njit(cache=True)
-def _squared_distance(S, e):  # type: ignore[no-untyped-def]
-    """e^T S^-1 e = |L^-1 e|^2 with S = L L^T. S and e are overwritten."""
-    q = 0.0
-    for i in range(len(e)):
-        for j in range(i):
-            for k in range(j):
-                S[i, j] -= S[i, k] * S[j, k]
-            S[i, j] /= S[j, j]
-            S[i, i] -= S[i, j] * S[i, j]
-            e[i] -= S[i, j] * e[j]
-        S[i, i] = np.sqrt(S[i, i])
-        e[i] /= S[i, i]
-        q += e[i] * e[i]
-    return q

@@ -16,7 +16,6 @@ from calibslam_msgs_py.measurements import Camera
 class Upkeep:
     """Looks after the assignments; `counts` is shared with the estimator."""
 
-    YOUNG = 30  # keyframes after which a quadric has settled
     UNSETTLED = 10  # newest keyframes, whose boxes are not judged anew yet
     LEAST_BOXES = 3  # fewer do not determine a quadric
     NUMBERS = 9  # that a quadric is made of
@@ -105,7 +104,7 @@ class Upkeep:
         pairs = vectors[:, None], vectors[None]
         # An older quadric of its place, size and class, never seen beside it, is the same object; even one seen beside
         # it, if both have settled at one place.
-        settled = np.array([self._assignments.age(j) >= self.YOUNG for j in ids])
+        settled = np.array([self._assignments.age(j) >= self._assignments.YOUNG for j in ids])
         inside = at_one_place(*pairs) & settled[:, None]
         gone = set()
         for m, n in np.argwhere(np.tril(same_object(*pairs, self._settings.merge_distance) | inside, -1))[::-1]:

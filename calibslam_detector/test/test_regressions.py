@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 
 import numpy as np
 import pytest
@@ -14,14 +13,7 @@ from calibslam_detector.regressions.tasks import BLURS, LABEL_SIGMA_PER_BLUR, SI
 
 SMALL = RegressionSettings(degrees=20, sums=50, batch=60, steps=20, size=0.1, effort=0.1)
 
-
-@pytest.fixture(autouse=True, scope="module")
-def one_thread() -> Iterator[None]:
-    """For small tensors more threads only wait for each other."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(threads)
+pytestmark = pytest.mark.usefixtures("one_thread")
 
 
 def test_curve_has_the_noise_it_says() -> None:
