@@ -81,6 +81,7 @@ class Estimator:
     SIGHTINGS_AGREE = 0.2  # [rad, m]
     START_ERROR = 1.0  # [rad, m] of a start pose that is given
     NIS_EVERY = 10  # keyframes, since it takes about as long as half an update's votes
+    SETTLE_EVERY = 2  # keyframes
     # At the end: rounds of association and optimisation, and when poses [rad, m] count as settled.
     ROUNDS, ITERATIONS_OF_A_ROUND, ITERATIONS, CONVERGED = 5, 2, 10, 5e-3
 
@@ -394,7 +395,9 @@ class Estimator:
         def revise() -> None:
             self._upkeep.revise(-(-self.settings.revised // 2))
 
-        return [look_for_known_and_new, revise, revise, self._settle]
+        chores = [look_for_known_and_new, revise, revise]
+        # Every update has a price of its own, whatever it relinearises.
+        return chores if k % self.SETTLE_EVERY else [*chores, self._settle]
 
     def _settle(self) -> None:
         report = self._graph.settle()

@@ -43,7 +43,7 @@ class GraphSettings(Settings):
     robust_scale: float = setting(2.0, "Mahalanobis distance beyond which a box is doubted", low=0.1, high=1e6)
     robust_odometry: float = setting(3.5, "Mahalanobis distance beyond which a motion is doubted", low=0.1, high=1e6)
     prior_sigma: float = setting(0.001, "first pose: it is the map's origin", unit="rad and m", low=1e-6)
-    relinearised: int = setting(30, "earlier keyframes, with each new one, that may be relinearised", low=1)
+    relinearised: int = setting(60, "earlier keyframes, with every second new one, that may be relinearised", low=1)
     relinearise_pose: float = setting(0.02, "change of a pose that asks for one", unit="rad and m", low=0.0)
     relinearise_quadric: float = setting(0.03, "change of a quadric that asks for one", unit="m and log m", low=0.0)
     young: int = setting(20, "keyframes during which a quadric is relinearised at once", low=0)
@@ -99,6 +99,7 @@ class ObjectGraph:
     LARGEST_STEP = 0.5  # [rad, m] of a pose in one update; more is checked by a damped optimisation
     REPAIR_ITERATIONS = 15
     NEW_POSES = 5  # that are relinearised at once
+    IN_SIGHT = 10  # keyframes for which a quadric that was seen counts as one that will be seen again soon
     FAR = 0.05  # [rad, m] that a pose may be from the base of its coordinates
     FOUND_SIGMA = 0.5  # [rad, m] of a pose found in a known map: its boxes say it better
 
@@ -114,7 +115,8 @@ class ObjectGraph:
         self._origin, self._origin_sigma = T_MAP_FIRST_CAMERA, settings.prior_sigma
         thresholds = {"x": (6, self.FAR), "q": (9, np.inf), "d": (DRIFT, np.inf)}
         self._smoother = Smoother(thresholds, self._linearise_boxes)
-        self._linearised: list[Array] = []  # (4, 4) of each pose where its factors were linearised
+        self._linearised = np.zeros((0, 4, 4))  # of each pose where its factors were linearised
+        self._extracted = self._smoother.values, np.zeros((0, 4, 4))  # an estimate and its poses
         self._next_turn = 0
 
     # -- what is in it ------------------------------------------------------------------------------------------
@@ -126,11 +128,19 @@ class ObjectGraph:
 
     def pose(self, k: int) -> Array:
         """(4, 4) T_map_camera of keyframe k."""
-        return np.asarray(self._smoother.values.atPose3(_x(k)).matrix())
+        return self._poses(self._smoother.values)[k].copy()
 
     def poses(self) -> Array:
         """(N, 4, 4) of all keyframes."""
-        return _poses(self._smoother.values)
+        return self._poses(self._smoother.values).copy()
+
+    def _poses(self, values: gtsam.Values) -> Array:
+        """(N, 4, 4) of all poses in their order, extracted once from each estimate."""
+        known, poses = self._extracted
+        if known is not values or len(poses) != self.size:
+            poses = _poses_of(values)
+            self._extracted = values, poses
+        return poses
 
     def odometry(self) -> tuple[Array, Array]:
         """What odometry alone says: poses (N, 4, 4) and their covariances (N, 6, 6), from the same origin."""
@@ -201,7 +211,7 @@ class ObjectGraph:
         origin = gtsam.Pose3(self._origin)
         noise = gtsam.noiseModel.Isotropic.Sigma(6, self._origin_sigma)
         self._smoother.insert(_x(0), origin)
-        self._linearised.append(self._origin)
+        self._linearised = self._origin[None]
         self._smoother.add("origin", gtsam.PriorFactorPose3(_x(0), origin, noise))
 
     def add_pose(self, motion: Motion, guess: Array) -> int:
@@ -217,7 +227,7 @@ class ObjectGraph:
             self._smoother.insert(_D, np.zeros(DRIFT))
             self._smoother.add("drift", gtsam.PriorFactorVector(_D, np.zeros(DRIFT), noise))
         self._smoother.insert(_x(k), gtsam.Pose3(guess))
-        self._linearised.append(guess)
+        self._linearised = np.append(self._linearised, guess[None], axis=0)
         factor = motion_factor(
             _x(k - 1), _x(k), _D, motion.T, motion.covariance, motion.drifts, self._settings.robust_odometry
         )
@@ -274,11 +284,11 @@ class ObjectGraph:
 
     def _step(self, solve: Callable[[], None]) -> UpdateReport:
         """Solve; what goes wrong is repaired and reported."""
-        before = gtsam.Values(self._smoother.values)
+        before, poses = self._smoother.values, self.poses()
         reason = ""
         try:
             solve()
-            if self._jumped(before):
+            if self._jumped(poses):
                 reason = "the trajectory jumped"
         except RuntimeError as error:
             reason = _first_sentence(error)
@@ -298,7 +308,7 @@ class ObjectGraph:
     def _rebuild(self, values: gtsam.Values) -> None:
         """The tree anew, all of it linearised at these values."""
         self._smoother.rebuild(values, self._last())
-        self._linearised = list(_poses(values))
+        self._linearised = self.poses()
         for j, landmark in self.landmarks.items():
             landmark.linearised = dict.fromkeys(landmark.boxes, values.atVector(_q(j)))
 
@@ -309,7 +319,7 @@ class ObjectGraph:
         boxes = [name for name in names if isinstance(name, tuple) and name[0] == "box"]
         tangents = box_tangents(
             [(_x(k), _q(j)) for _, k, j in boxes],
-            _poses(values)[[k for _, k, _ in boxes]],
+            self._poses(values)[[k for _, k, _ in boxes]],
             vectors[[rows[j] for _, _, j in boxes]],
             [self.landmarks[j].boxes[k] for _, k, j in boxes],
             self._K,
@@ -318,9 +328,14 @@ class ObjectGraph:
         return dict(zip(boxes, tangents, strict=True))
 
     def _last(self) -> list[int]:
-        """Quadrics, the drift and the newest pose are eliminated last: the next update will touch them again."""
+        """Quadrics in sight, the newest pose and the drift are eliminated last: the next update will touch them again.
+
+        All quadrics would make the root of the tree grow with the map, and with it the cost of every update.
+        """
         drift = [_D] if self._drifts else []
-        return [*map(_q, self.landmarks), _x(self.size - 1), *drift]
+        recent = range(max(self.size - self.IN_SIGHT, 0), self.size)
+        in_sight = [j for j, known in self.landmarks.items() if any(k in known.boxes for k in recent)]
+        return [*map(_q, in_sight), _x(self.size - 1), *drift]
 
     def _turn(self) -> range:
         """The earlier keyframes that are looked at now."""
@@ -334,7 +349,7 @@ class ObjectGraph:
         Returns how many.
         """
         s = self._settings
-        poses = _poses(self._smoother.values)
+        poses = self.poses()
         moved = np.abs(poses - self._linearised).max(axis=(1, 2)) > s.relinearise_pose
         names: dict[Hashable, None] = {}  # each once, in a fixed order
         for k in turn:
@@ -371,9 +386,9 @@ class ObjectGraph:
         )
         return [j for j, fine in zip(ids, sane, strict=True) if not fine]
 
-    def _jumped(self, before: gtsam.Values) -> bool:
-        """Whether a pose moved farther than an undamped step can be trusted with."""
-        old, new = _poses(before), _poses(self._smoother.values)
+    def _jumped(self, old: Array) -> bool:
+        """Whether a pose moved from where it was (N, 4, 4) farther than an undamped step can be trusted with."""
+        new = self.poses()
         moved = np.linalg.norm(new[:, :3, 3] - old[:, :3, 3], axis=1)
         # The norm of the difference of two rotations is 2 sqrt(2) sin(angle / 2).
         turned = np.linalg.norm(new[:, :3, :3] - old[:, :3, :3], axis=(1, 2)) / np.sqrt(2.0)
@@ -384,6 +399,7 @@ class ObjectGraph:
 
         If even that fails, quadrics are given up, the youngest first.
         """
+        before = gtsam.Values(before)
         while True:
             try:
                 values = self._smoother.optimise(before, self.REPAIR_ITERATIONS)
@@ -398,7 +414,7 @@ class ObjectGraph:
                 before.erase(_q(youngest))
 
 
-def _poses(values: gtsam.Values) -> Array:
+def _poses_of(values: gtsam.Values) -> Array:
     """(N, 4, 4) of all poses, in their order."""
     rows = gtsam.utilities.extractPose3(values)  # rotation by rows, translation
     poses = np.tile(np.eye(4), (len(rows), 1, 1))

@@ -190,6 +190,8 @@ def overlaps_at(T, centres, surfaces, K, size, corners, compatible):  # type: ig
     result = np.zeros((len(corners), len(centres)))
     c, N = np.empty(3), np.empty((3, 3))
     for m in range(len(centres)):
+        if not compatible[:, m].any():
+            continue
         # c = R^T (centre - t) and N = R^T surface R - c c^T, its upper half: loops, since products of small matrices
         # spend their time on memory.
         for a in range(3):
