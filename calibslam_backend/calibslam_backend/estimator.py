@@ -395,9 +395,9 @@ class Estimator:
         def revise() -> None:
             self._upkeep.revise(-(-self.settings.revised // 2))
 
-        chores = [look_for_known_and_new, revise, revise]
         # Every update has a price of its own, whatever it relinearises.
-        return chores if k % self.SETTLE_EVERY else [*chores, self._settle]
+        last = [] if k % self.SETTLE_EVERY else [self._settle]
+        return [look_for_known_and_new, revise, revise, *last]
 
     def _settle(self) -> None:
         report = self._graph.settle()
