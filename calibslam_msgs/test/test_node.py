@@ -5,7 +5,7 @@ import subprocess
 import sys
 import textwrap
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 import pytest
 import rclpy
@@ -19,6 +19,7 @@ from std_msgs.msg import String
 from calibslam_msgs_py.measurements import SECOND, InvalidMeasurement
 from calibslam_msgs_py.node import LATCHED, MEASUREMENT, MEASUREMENT_INPUT, SENSOR, Counters, subscribe
 
+PATIENCE = 120.0  # [s] for what takes a second on an idle machine
 NODE = textwrap.dedent("""
     import sys
     from calibslam_msgs_py.node import run
@@ -57,7 +58,7 @@ def test_signals_end_a_node_with_0(number: signal.Signals) -> None:
     process = start()
     assert process.stdout is not None and process.stdout.readline() == "started\n"
     process.send_signal(number)
-    output, errors = process.communicate(timeout=20)
+    output, errors = process.communicate(timeout=PATIENCE)
     assert (process.returncode, errors) == (0, "")
     assert output.endswith("closed\n")
 
@@ -71,7 +72,7 @@ def test_signals_end_a_node_with_0(number: signal.Signals) -> None:
 )
 def test_bad_parameters_end_a_node_with_2(parameter: str, text: str) -> None:
     process = start("-p", parameter)
-    _, errors = process.communicate(timeout=20)
+    _, errors = process.communicate(timeout=PATIENCE)
     assert process.returncode == 2
     assert text in errors and "Traceback" not in errors
 
@@ -85,12 +86,16 @@ def nodes() -> Iterator[tuple[Node, Node, SingleThreadedExecutor]]:
     for node in pair:
         executor.add_node(node)
     yield *pair, executor
+    executor.shutdown()
+    for node in pair:
+        node.destroy_node()  # or the next test meets it
     context.try_shutdown()
 
 
-def spin_until(executor: SingleThreadedExecutor, condition: object, seconds: float = 10.0) -> None:
-    end = time.monotonic() + seconds
-    while not condition() and time.monotonic() < end:  # type: ignore[operator]
+def spin_until(executor: SingleThreadedExecutor, condition: Callable[[], object]) -> None:
+    end = time.monotonic() + PATIENCE
+    while not condition():
+        assert time.monotonic() < end, "nothing comes"
         executor.spin_once(timeout_sec=0.1)
 
 
@@ -149,7 +154,7 @@ def test_inputs_and_what_the_node_adds_reach_diagnostics(nodes: tuple[Node, Node
     values = {v.key: v.value for v in status.values}
     assert values["memory_mb"] == "12" and values["rejected_nan"] == "3"
     assert float(values["detections_hz"]) > 0.0 and float(values["detections_age_s"]) >= 0.0
-    assert float(values["detections_delay_s"]) == pytest.approx(2.0, abs=0.1)
+    assert 2.0 <= float(values["detections_delay_s"]) < 2.0 + PATIENCE
     assert (status.level, status.message) == (DiagnosticStatus.ERROR, "errors_journal, rejected_nan")
 
 
@@ -165,3 +170,4 @@ def test_an_override_is_of_one_topic_only(nodes: tuple[Node, Node, SingleThreade
     }
     assert found == {"kept": DurabilityPolicy.TRANSIENT_LOCAL, "plain": DurabilityPolicy.VOLATILE}
     assert MEASUREMENT_INPUT.durability != DurabilityPolicy.TRANSIENT_LOCAL
+    node.destroy_node()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import random
 import signal
 import subprocess
 import sys
@@ -16,6 +15,7 @@ from typing import Any
 
 import numpy as np
 import rclpy
+from dds_domain import random_domain as random_domain
 from diagnostic_msgs.msg import DiagnosticArray
 from nav_msgs.msg import Path as PathMessage
 from rclpy.node import Node
@@ -39,11 +39,6 @@ def wait_until(condition: Callable[[], Any], what: str | Callable[[], str], time
             raise TimedOut(f"after {timeout:.0f} s: {what if isinstance(what, str) else what()}")
         time.sleep(0.02)
     return value
-
-
-def random_domain() -> int:
-    """A DDS domain of a test's own."""
-    return random.SystemRandom().randrange(1, 101)
 
 
 def executable(package: str, name: str) -> Path:
