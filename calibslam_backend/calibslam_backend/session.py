@@ -6,6 +6,7 @@ in the same state.
 
 from __future__ import annotations
 
+import gc
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -163,7 +164,8 @@ class Session:
         if isinstance(content, Boxes | RelativeMotion):
             self._add(content, event.arrived)
         elif isinstance(content, StampedPose):
-            self.estimator.start_at(content.T)
+            estimator, T = self.estimator, content.T
+            self._begin(lambda: estimator.start_at(T))
             self._guard.reset()
         elif isinstance(content, ObjectMap):
             self.estimator.load(content)
@@ -186,8 +188,10 @@ class Session:
         if present.jumped:
             self._report.count("time_jumps")
             self._report.say("time has jumped back: a new trajectory begins")
-            self.tally.tell(self.estimator)
-            self.estimator.begin_again(self._settings.time_jump == KEEP_MAP)
+            estimator = self.estimator
+            self._begin(lambda: estimator.begin_again(self._settings.time_jump == KEEP_MAP))
+        elif len(self.estimator.stamps) >= self._settings.max_keyframes:
+            self._end_trajectory()
         for each in present.measurements:
             try:
                 keyframes = self.estimator.add(each)
@@ -197,8 +201,30 @@ class Session:
             self.tally.keyframes(keyframes, arrived)
             if keyframes:
                 self.pose_is_new, self.map_is_new, self.refined = True, True, False
-        if dropped := self.estimator.limit_waiting(self._settings.images_without_odometry):
-            self._report.reject(InvalidMeasurement("no_odometry", f"{dropped} images: there is no odometry"), dropped)
+        self._left_out(self.estimator.limit_waiting(self._settings.images_without_odometry))
+
+    def _end_trajectory(self) -> None:
+        """It has become too long to be kept: go on where it ends, with the objects there are."""
+        assert self.estimator is not None
+        estimator = self.estimator
+        self._report.count("trajectories_ended")
+        self._report.say(f"{len(estimator.stamps)} keyframes (max_keyframes): a new trajectory begins in the map")
+        if estimator.objects:
+            self._begin(lambda: estimator.start_at(estimator.body_pose()))
+        else:
+            self._begin(lambda: estimator.begin_again(keep_map=False))
+        gc.collect()  # a graph is in reference cycles
+
+    def _begin(self, begin: Callable[[], None]) -> None:
+        """Begin a trajectory; images that wait for the odometry of the one before are left out."""
+        assert self.estimator is not None
+        waiting = self.estimator.waiting
+        begin()
+        self._left_out(waiting - self.estimator.waiting)
+
+    def _left_out(self, images: int) -> None:
+        if images:
+            self._report.reject(InvalidMeasurement("no_odometry", f"{images} images: there is no odometry"), images)
 
     def _set_camera(self, event: Event) -> None:
         assert isinstance(event.content, Camera)

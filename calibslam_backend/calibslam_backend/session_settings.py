@@ -19,3 +19,8 @@ class SessionSettings(TimeSettings):
     images_without_odometry: int = setting(
         1000, "images that may wait for odometry; the latest ones beyond are dropped", low=1
     )
+    max_keyframes: int = setting(
+        10_000,
+        "of a trajectory, which bounds memory; then a new one begins where it ends, with the objects there are",
+        low=10,
+    )

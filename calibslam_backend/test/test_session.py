@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pickle
+import weakref
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
@@ -226,6 +227,79 @@ def test_a_looping_bag(time_jump: str, objects_kept: bool) -> None:
     # The first image of all came before the motions that tell of the jump.
     assert (session.counts["images"], session.counts["rejected_late"]) == (239, 1)
     assert session.error() < 0.05 and not session.counts["errors"]
+
+
+LIMITED = SessionSettings(refine_after=1e6, max_keyframes=12)
+THERE_AND_BACK = SmallWorld(np.concatenate([around(120), around(120)[::-1], around(120)]), objects())
+
+
+def test_a_trajectory_that_is_too_long_is_followed_by_another_one() -> None:
+    """All objects stay, each measurement is used, and the pose goes on."""
+    session, poses, objects_before = live(settings=LIMITED), [], 0
+    for measurement in THERE_AND_BACK.measurements():
+        session.use([measurement])
+        assert session.estimator is not None and len(session.estimator.stamps) <= 12
+        assert session.estimator.objects >= objects_before - 1  # two may turn out to be one
+        objects_before = session.estimator.objects
+        if session.pose_is_new:
+            session.pose_is_new = False
+            poses.append((session.estimator.stamps[-1], session.trajectory()[-1]))
+    assert session.counts["trajectories_ended"] == (len(poses) - 1) // 12 > 4
+    assert session.counts["keyframes"] == len(poses)
+    assert (session.counts["images"], session.counts["motions"]) == (360, 359)
+    assert not any(name.startswith(("rejected_no", "rejected_before", "errors")) for name in session.counts)
+    stamps, T = zip(*poses, strict=True)
+    assert ate(Trajectory(np.array(stamps), np.array(T)), THERE_AND_BACK.truth()) < 0.05
+    steps = np.linalg.norm(np.diff(np.array(T)[:, :3, 3], axis=0), axis=1)
+    assert steps.max() < 0.3
+
+
+def test_a_trajectory_that_is_too_long_without_any_object() -> None:
+    """There is no map in which it could go on: it begins anew at the origin, and images go on being used."""
+    seeing_nothing = [
+        replace(
+            m, corners=m.corners[:0], covariances=m.covariances[:0], class_ids=(), scores=m.scores[:0], object_ids=()
+        )
+        if isinstance(m, Boxes)
+        else m
+        for m in MEASUREMENTS
+    ]
+    session = live(settings=LIMITED).use(seeing_nothing)
+    assert session.counts["trajectories_ended"] >= 1 and session.counts["images"] == 120
+    assert session.estimator is not None and 0 < len(session.estimator.stamps) <= 12
+
+
+def test_trajectories_that_are_ended_are_freed() -> None:
+    session = live(settings=LIMITED)
+    graphs = []
+    for measurement in THERE_AND_BACK.measurements():
+        session.use([measurement])
+        assert session.estimator is not None
+        if not graphs or graphs[-1]() is not session.estimator._graph:
+            graphs.append(weakref.ref(session.estimator._graph))
+            assert sum(graph() is not None for graph in graphs) == 1
+    assert len(graphs) > 4
+
+
+def test_a_killed_session_ends_its_trajectories_where_it_did(tmp_path: Path) -> None:
+    first = live(tmp_path / "journal", LIMITED).use(list(THERE_AND_BACK.measurements()))
+    assert first.intake.journal is not None
+    first.intake.journal.close()
+    again = live(tmp_path / "journal", LIMITED)
+    assert again.counts["trajectories_ended"] == first.counts["trajectories_ended"] > 4
+    assert (again.trajectory() == first.trajectory()).all()
+
+
+def test_images_that_wait_when_a_new_trajectory_begins_are_counted() -> None:
+    session = live().use(MEASUREMENTS)
+    assert session.estimator is not None
+    session.use([replace(WORLD.boxes()[-1], stamp=WORLD.stamps[-1] + n) for n in (1, 2, 3)])
+    assert session.estimator.waiting == 3
+    session.use([StampedPose(0, session.trajectory()[-1])])
+    assert (session.estimator.waiting, session.counts["rejected_no_odometry"]) == (0, 3)
+    early = live().use([WORLD.boxes()[0], StampedPose(0, np.eye(4))])  # refused: there is no map
+    assert early.estimator is not None
+    assert (early.estimator.waiting, early.counts["rejected_no_odometry"]) == (1, 0)
 
 
 def test_images_without_odometry_are_bounded() -> None:
