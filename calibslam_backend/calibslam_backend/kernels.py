@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import functools
 import gc
+import sys
 
 import gtsam
 import numpy as np
+from numba.core.event import Event, Listener, install_listener
 
 from calibslam_backend.box_factor import box_factor, box_tangents
 from calibslam_backend.box_measurement import BoxMeasurement
@@ -19,9 +21,32 @@ from calibslam_backend.robust import robust_scales
 from calibslam_backend.tracking import overlap
 
 
+class Announcement(Listener):
+    """Says that something is being compiled, when it first is: what comes from the cache is not."""
+
+    def __init__(self) -> None:
+        self._said = False
+
+    def on_start(self, event: Event) -> None:
+        if not self._said:
+            print("compiling, only this once: about 30 s ...", file=sys.stderr, flush=True)
+        self._said = True
+
+    def on_end(self, event: Event) -> None:
+        """Of one function."""
+
+
 @functools.cache
 def load_kernels() -> None:
     """Call each compiled function once, with the argument types it will have; 0.7 s, or 30 s the first time."""
+    with install_listener("numba:compile", Announcement()):
+        _call_each()
+    # What is loaded by now stays: a full collection that looks at all of it would hold up an update by 0.1 s.
+    gc.collect()
+    gc.freeze()
+
+
+def _call_each() -> None:
     K = np.array([[500.0, 0.0, 320.0], [0.0, 500.0, 240.0], [0.0, 0.0, 1.0]])
     bounds = np.array([0.0, 0.0, 640.0, 480.0])
     vector = Ellipsoid(gtsam.Pose3(gtsam.Rot3(), np.array([0.0, 0.0, 2.0])).matrix(), np.full(3, 0.2)).vector()
@@ -49,6 +74,3 @@ def load_kernels() -> None:
         bounds[None].copy(), ~ALL_EDGES[None], 0.1
     )  # fmt: skip
     localise(poses[0].matrix(), np.eye(6), [values.atVector(1)], boxes[:1], K, 1.0, 1.0)
-    # What is loaded by now stays: a full collection that looks at all of it would hold up an update by 0.1 s.
-    gc.collect()
-    gc.freeze()

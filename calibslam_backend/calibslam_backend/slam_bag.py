@@ -181,7 +181,7 @@ def _summary(out: Path, metrics: dict[str, object]) -> None:
         f"{metrics['keyframes']} keyframes, {metrics['objects']} objects, "
         f"{metrics['boxes_used']} boxes used, {metrics['boxes_rejected']} rejected\n"
         f"ATE {metre(metrics['ate_m'])} (odometry alone: {metre(metrics['odometry_ate_m'])})\n"
-        f"result: {out}"
+        f"result: {out}, picture: {out / 'trajectory.png'}"
     )
 
 

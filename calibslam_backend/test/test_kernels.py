@@ -5,12 +5,15 @@ from __future__ import annotations
 import sys
 from dataclasses import replace
 
+import numba
 import numpy as np
+import pytest
+from numba.core.event import install_listener
 from small_world import CAMERA, SmallWorld, around, objects
 
 from calibslam_backend.association import ESTIMATED
 from calibslam_backend.estimator import Estimator, EstimatorSettings
-from calibslam_backend.kernels import load_kernels
+from calibslam_backend.kernels import Announcement, load_kernels
 
 
 def compiled() -> dict[str, list[str]]:
@@ -36,3 +39,12 @@ def test_a_run_compiles_nothing() -> None:
     assert estimator.objects
     assert before["calibslam_backend.revision.squared_distances"]
     assert compiled() == before
+
+
+def test_compiling_is_announced_once(capsys: pytest.CaptureFixture[str]) -> None:
+    with install_listener("numba:compile", Announcement()):
+        assert capsys.readouterr().err == ""
+        for _ in range(2):  # neither is in a cache
+            assert numba.njit(lambda x: x + 1)(1) == 2
+    assert numba.njit(lambda x: x + 2)(1) == 3
+    assert capsys.readouterr().err.count("compiling, only this once") == 1
