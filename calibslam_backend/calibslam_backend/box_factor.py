@@ -11,6 +11,7 @@ import gtsam
 import numba
 import numpy as np
 
+from calibslam_backend.box_correlation import BoxCorrelation
 from calibslam_backend.box_measurement import BoxMeasurement
 from calibslam_backend.quadric import POSE, QUADRIC, box_of_visible_part
 from calibslam_backend.robust import robust_scales
@@ -50,20 +51,31 @@ def _weighted(T_map_camera, quadric, K, measured, k):  # type: ignore[no-untyped
 
 
 @numba.njit(cache=True)
-def _tangents(poses, quadrics, K, measured, k):  # type: ignore[no-untyped-def]
-    """(N, 16, 4) of N boxes: the transposed Jacobian by pose and quadric, and minus the residual."""
-    result = np.empty((len(poses), 16, 4))
+def _tangents(poses, quadrics, K, measured, k, worth):  # type: ignore[no-untyped-def]
+    """(N, 17, 4) of N boxes: the transposed Jacobian by pose and quadric, minus the residual, and the residual of a box
+    that counts fully."""
+    result = np.empty((len(poses), 17, 4))
+    scale = np.sqrt(worth)
     for n in range(len(poses)):
         weighted = _weighted(poses[n], quadrics[n], K, measured[n], k)
-        result[n, :15] = weighted[:, :15].T
-        result[n, 15] = -weighted[:, 15]
+        result[n, :15] = scale * weighted[:, :15].T
+        result[n, 15] = -scale * weighted[:, 15]
+        result[n, 16] = weighted[:, 15]
     return result
 
 
 _UNIT = gtsam.noiseModel.Unit.Create(4)
+INDEPENDENT = BoxCorrelation(is_estimated=False)
 
 
-def box_factor(pose: int, quadric: int, box: BoxMeasurement, K: Array, robust_scale: float) -> gtsam.CustomFactor:
+def box_factor(
+    pose: int,
+    quadric: int,
+    box: BoxMeasurement,
+    K: Array,
+    robust_scale: float,
+    correlation: BoxCorrelation = INDEPENDENT,
+) -> gtsam.CustomFactor:
     """The factor for one box.
 
     Args:
@@ -72,12 +84,13 @@ def box_factor(pose: int, quadric: int, box: BoxMeasurement, K: Array, robust_sc
         box: what was measured.
         K: (3, 3) camera matrix [px].
         robust_scale: k, the Mahalanobis distance beyond which a box is doubted.
+        correlation: by which errors of neighbouring boxes are alike, as known when the factor is evaluated.
     """
     measured = box.packed
 
     def error(_: gtsam.CustomFactor, values: gtsam.Values, H: list[Array] | None) -> Array:
         T, vector = values.atPose3(pose).matrix(), values.atVector(quadric)
-        result: Array = _weighted(T, vector, K, measured, robust_scale)
+        result: Array = np.sqrt(correlation.worth) * _weighted(T, vector, K, measured, robust_scale)
         if H is None:
             return result[:, 16]
         H[0], H[1] = result[:, POSE], result[:, QUADRIC]
@@ -93,7 +106,8 @@ def box_tangents(
     boxes: Sequence[BoxMeasurement],
     K: Array,
     robust_scale: float,
-) -> list[gtsam.JacobianFactor]:
+    worth: float = 1.0,
+) -> tuple[list[gtsam.JacobianFactor], Array]:
     """The linearised factors of N boxes, as `box_factor(...).linearize` has them, in a third of the time.
 
     Args:
@@ -102,11 +116,16 @@ def box_tangents(
         quadrics: (N, 9) vectors.
         boxes: N.
         K, robust_scale: see `box_factor`.
+        worth: share of their log-likelihood that counts.
+
+    Returns:
+        The factors, and the residuals (N, 4) of the boxes in standard deviations, those of doubted ones reduced.
     """
     if not boxes:
-        return []
-    rows = _tangents(poses, quadrics, K, np.stack([box.packed for box in boxes]), robust_scale)
-    return [
+        return [], np.zeros((0, 4))
+    rows = _tangents(poses, quadrics, K, np.stack([box.packed for box in boxes]), robust_scale, worth)
+    factors = [
         gtsam.JacobianFactor(pose, row[POSE].T, quadric, row[QUADRIC].T, row[15], _UNIT)
         for (pose, quadric), row in zip(keys, rows, strict=True)
     ]
+    return factors, rows[:, 16]

@@ -20,6 +20,7 @@ def of_session(session: Session) -> Mapping[str, str]:
     if estimator is not None:
         values["objects"] = str(estimator.objects)
         values["images_waiting_for_odometry"] = str(estimator.waiting)
+        values["box_correlation"] = f"{estimator.box_correlation:.2f}"
     if session.intake.journal_problem:
         values["journal"] = session.intake.journal_problem
     for name in ("update_ms", "between_ms", "delay_ms"):

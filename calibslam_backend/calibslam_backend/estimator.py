@@ -243,6 +243,11 @@ class Estimator:
         """Number of boxes that quadrics rest on."""
         return sum(len(landmark.boxes) for landmark in self._graph.landmarks.values())
 
+    @property
+    def box_correlation(self) -> float:
+        """Of the errors of an object's boxes in consecutive keyframes, as far as residuals show it."""
+        return self._graph.correlation.correlation
+
     def body_pose(self) -> Array:
         """(4, 4) T_map_body of the newest keyframe."""
         return self.pose(len(self.stamps) - 1) @ np.linalg.inv(self._T_body_camera)

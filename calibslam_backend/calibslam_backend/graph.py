@@ -18,6 +18,7 @@ import gtsam
 import numpy as np
 from gtsam import symbol
 
+from calibslam_backend.box_correlation import BoxCorrelation
 from calibslam_backend.box_factor import box_factor, box_tangents
 from calibslam_backend.box_measurement import BoxMeasurement
 from calibslam_backend.initialisation import InitialisationSettings
@@ -41,6 +42,9 @@ T_MAP_FIRST_CAMERA = np.array(
 @dataclass(frozen=True)
 class GraphSettings(Settings):
     robust_scale: float = setting(2.0, "Mahalanobis distance beyond which a box is doubted", low=0.1, high=1e6)
+    box_correlation: bool = setting(
+        True, "whether boxes count less where the errors of an object's boxes in consecutive keyframes are alike"
+    )
     robust_odometry: float = setting(3.5, "Mahalanobis distance beyond which a motion is doubted", low=0.1, high=1e6)
     prior_sigma: float = setting(0.001, "first pose: it is the map's origin", unit="rad and m", low=1e-6)
     relinearised: int = setting(60, "earlier keyframes, with every second new one, that may be relinearised", low=1)
@@ -74,13 +78,15 @@ class Landmark:
         born: keyframe.
         prior: (9, 9) covariance.
         boxes: by keyframe.
-        linearised: for each box the vector (9,) of the quadric at which it was linearised last.
+        linearised: for each box the vector (9,) of the quadric at which it was linearised last, and what it was worth.
+        residuals: (4,) of each box there.
     """
 
     born: int
     prior: Array
     boxes: dict[int, BoxMeasurement] = field(default_factory=dict)
-    linearised: dict[int, Array] = field(default_factory=dict)
+    linearised: dict[int, tuple[Array, float]] = field(default_factory=dict)
+    residuals: dict[int, Array] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -101,6 +107,7 @@ class ObjectGraph:
     NEW_POSES = 5  # that are relinearised at once
     IN_SIGHT = 10  # keyframes for which a quadric that was seen counts as one that will be seen again soon
     FAR = 0.05  # [rad, m] that a pose may be from the base of its coordinates
+    WORTH_CHANGED = 0.1  # share by which a box's worth has to change for it to be relinearised
     FOUND_SIGMA = 0.5  # [rad, m] of a pose found in a known map: its boxes say it better
 
     def __init__(self, K: Array, settings: GraphSettings, priors: InitialisationSettings, noise: MotionNoise) -> None:
@@ -112,6 +119,7 @@ class ObjectGraph:
         self._has_origin = False
         self._motions: list[Motion] = []
         self.landmarks: dict[int, Landmark] = {}
+        self.correlation = BoxCorrelation(settings.box_correlation)
         self._origin, self._origin_sigma = T_MAP_FIRST_CAMERA, settings.prior_sigma
         thresholds = {"x": (6, self.FAR), "q": (9, np.inf), "d": (DRIFT, np.inf)}
         self._smoother = Smoother(thresholds, self._linearise_boxes)
@@ -247,15 +255,16 @@ class ObjectGraph:
 
     def add_box(self, k: int, j: int, box: BoxMeasurement) -> None:
         """A box of quadric j in keyframe k, which must be its only one there."""
-        factor = box_factor(_x(k), _q(j), box, self._K, self._settings.robust_scale)
+        factor = box_factor(_x(k), _q(j), box, self._K, self._settings.robust_scale, self.correlation)
         self._smoother.add(("box", k, j), factor)
         self.landmarks[j].boxes[k] = box
-        self.landmarks[j].linearised[k] = self.quadric(j)
+        self.landmarks[j].linearised[k] = self.quadric(j), self.correlation.worth
 
     def remove_box(self, k: int, j: int) -> None:
         """The box of quadric j in keyframe k is of something else."""
-        del self.landmarks[j].boxes[k]
-        del self.landmarks[j].linearised[k]
+        known = self.landmarks[j]
+        del known.boxes[k], known.linearised[k]
+        known.residuals.pop(k, None)
         self._smoother.remove(("box", k, j))
 
     def remove_quadric(self, j: int) -> None:
@@ -310,22 +319,33 @@ class ObjectGraph:
         self._smoother.rebuild(values, self._last())
         self._linearised = self.poses()
         for j, landmark in self.landmarks.items():
-            landmark.linearised = dict.fromkeys(landmark.boxes, values.atVector(_q(j)))
+            landmark.linearised = dict.fromkeys(landmark.boxes, (values.atVector(_q(j)), self.correlation.worth))
 
     def _linearise_boxes(self, names: Iterable[Hashable], values: gtsam.Values) -> dict[Hashable, gtsam.JacobianFactor]:
         """The tangents of those of these factors that are boxes."""
         ids, vectors = self._quadrics(values)
         rows = {j: row for row, j in enumerate(ids)}
         boxes = [name for name in names if isinstance(name, tuple) and name[0] == "box"]
-        tangents = box_tangents(
+        tangents, residuals = box_tangents(
             [(_x(k), _q(j)) for _, k, j in boxes],
             self._poses(values)[[k for _, k, _ in boxes]],
             vectors[[rows[j] for _, _, j in boxes]],
             [self.landmarks[j].boxes[k] for _, k, j in boxes],
             self._K,
             self._settings.robust_scale,
+            self.correlation.worth,
         )
+        self._learn_correlation(boxes, residuals)
         return dict(zip(boxes, tangents, strict=True))
+
+    def _learn_correlation(self, boxes: list[tuple[str, int, int]], residuals: Array) -> None:
+        """From the residuals (N, 4) of these boxes and of those of the same quadrics in the keyframes before."""
+        for (_, k, j), residual in zip(boxes, residuals, strict=True):
+            self.landmarks[j].residuals[k] = residual
+        rows = [n for n, (_, k, j) in enumerate(boxes) if k - 1 in self.landmarks[j].residuals]
+        if rows:
+            before = np.stack([self.landmarks[j].residuals[k - 1] for _, k, j in (boxes[n] for n in rows)])
+            self.correlation.learn(before, residuals[rows])
 
     def _last(self) -> list[int]:
         """Quadrics in sight, the newest pose and the drift are eliminated last: the next update will touch them again.
@@ -349,7 +369,7 @@ class ObjectGraph:
         Returns how many.
         """
         s = self._settings
-        poses = self.poses()
+        poses, worth = self.poses(), self.correlation.worth
         moved = np.abs(poses - self._linearised).max(axis=(1, 2)) > s.relinearise_pose
         names: dict[Hashable, None] = {}  # each once, in a fixed order
         for k in turn:
@@ -359,8 +379,13 @@ class ObjectGraph:
             landmark = self.landmarks[j]
             young = self.size - landmark.born <= s.young
             for k in landmark.boxes if young else [k for k in turn if k in landmark.boxes]:
-                if moved[k] or np.abs(vector - landmark.linearised[k]).max() > s.relinearise_quadric:
-                    landmark.linearised[k] = vector
+                where, then = landmark.linearised[k]
+                if (
+                    moved[k]
+                    or abs(worth - then) > self.WORTH_CHANGED * worth
+                    or np.abs(vector - where).max() > s.relinearise_quadric
+                ):
+                    landmark.linearised[k] = vector, worth
                     names["box", k, j] = None
         for k in turn:
             if moved[k]:

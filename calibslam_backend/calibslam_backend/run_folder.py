@@ -27,6 +27,7 @@ class RunRecord:
         seconds: (N,) each keyframe's update.
         between: (N,) the longest that an image since the keyframe before took.
         boxes_used, boxes_rejected: numbers.
+        box_correlation: of the errors of an object's boxes in consecutive keyframes.
         rejected: why, and other counts.
         associations: quadric and true identity of each box of a keyframe.
         wall_s, sequence_s: duration of the run and of the recording.
@@ -41,6 +42,7 @@ class RunRecord:
     between: Array
     boxes_used: int
     boxes_rejected: int
+    box_correlation: float
     rejected: dict[str, int]
     associations: Sequence[tuple[int | None, str]]
     wall_s: float
@@ -87,6 +89,7 @@ def metrics_of(result: ObjectMap, record: RunRecord, truth: Trajectory | None) -
         "objects": len(result.quadrics),
         "boxes_used": record.boxes_used,
         "boxes_rejected": record.boxes_rejected,
+        "box_correlation": record.box_correlation,
         "rejected": record.rejected,
         "update_ms": milliseconds(record.seconds),
         "between_ms": milliseconds(record.between),

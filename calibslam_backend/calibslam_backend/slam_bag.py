@@ -142,6 +142,7 @@ def run_record(
         between=np.array([keyframe.between for keyframe in keyframes]),
         boxes_used=estimator.boxes_used,
         boxes_rejected=sum(rejections.values()),
+        box_correlation=estimator.box_correlation,
         rejected={**rejections, **{k: n for k, n in counts.items() if not k.startswith("rejected_")}},
         associations=estimator.associations(),
         wall_s=wall_s,

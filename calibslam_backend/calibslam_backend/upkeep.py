@@ -19,8 +19,6 @@ class Upkeep:
     UNSETTLED = 10  # newest keyframes, whose boxes are not judged anew yet
     LEAST_BOXES = 3  # fewer do not determine a quadric
     NUMBERS = 9  # that a quadric is made of
-    # Boxes of neighbouring keyframes err alike: with a correlation of 0.6 (fr3_office) so many say as much as one.
-    ALIKE = 4.0
 
     def __init__(
         self, assignments: Assignments, camera: Camera, settings: EstimatorSettings, counts: Counter[str]
@@ -164,4 +162,5 @@ class Upkeep:
             free = {m: fit for m, fit in fits.items() if m in alike and m not in frame.quadrics}
             others[k] = min(free, key=free.__getitem__, default=None)
             lost += min(free.values(), default=0.0) - fits.get(j, 0.0)
-        return others if lost / self.ALIKE < self.NUMBERS * np.log(max(len(keyframes), 1)) else None
+        lost *= self._graph.correlation.worth
+        return others if lost < self.NUMBERS * np.log(max(len(keyframes), 1)) else None

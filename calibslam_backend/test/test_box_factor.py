@@ -9,7 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numerical import assert_jacobians
 
-from calibslam_backend.box_factor import INVISIBLE, box_factor, whitened_residual
+from calibslam_backend.box_correlation import BoxCorrelation
+from calibslam_backend.box_factor import INVISIBLE, box_factor, box_tangents, whitened_residual
 from calibslam_backend.box_measurement import BoxMeasurement
 from calibslam_backend.quadric import ALL_EDGES, Ellipsoid, box_of_visible_part, image_bounds
 from calibslam_msgs_py.measurements import Array
@@ -151,3 +152,24 @@ def test_absurd_quadrics_give_no_nan(vector: Array) -> None:
     factor, values = factor_of(np.array([1.0, 1, 2, 2]), 2.0), values_of(POSE, vector)
     A, b = linearised(factor, values)
     assert np.isfinite(A).all() and np.isfinite(b).all() and np.isfinite(factor.error(values))
+
+
+@pytest.mark.parametrize("size", [0.1, 50.0])
+def test_a_box_like_its_neighbours_counts_less(size: float) -> None:
+    """By the same share in error, gradient and tangent; the residual that the correlation is learnt from stays."""
+    correlation = BoxCorrelation()
+    half = np.full((1000, 4), 0.5)
+    correlation.learn(half, half)
+    assert 0.01 < correlation.worth < 0.5
+    quadric, whitener = quadric_at(0.1, 0.05, 2.0), np.linalg.inv(np.linalg.cholesky(COVARIANCE))
+    box = BoxMeasurement(predicted(quadric) + size, whitener, BOUNDS, ~ALL_EDGES)
+    values, keys = values_of(POSE, quadric), [(X, Q)]
+    alone, like = box_factor(X, Q, box, K, 2.0), box_factor(X, Q, box, K, 2.0, correlation)
+    assert like.error(values) == pytest.approx(correlation.worth * alone.error(values))
+    A, b = linearised(like, values)
+    arrays = keys, POSE.matrix()[None].copy(), quadric[None], [box], K, 2.0
+    (tangent,), residuals = box_tangents(*arrays, correlation.worth)
+    np.testing.assert_allclose(tangent.jacobian()[0], A, atol=1e-12)
+    np.testing.assert_allclose(tangent.jacobian()[1], b, atol=1e-12)
+    np.testing.assert_allclose(residuals, -linearised(alone, values)[1][None], atol=1e-12)
+    np.testing.assert_allclose(residuals, box_tangents(*arrays)[1])

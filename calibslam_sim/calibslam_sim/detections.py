@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from calibslam_backend.quadric import image_bounds, project
-from calibslam_msgs_py.measurements import Array, Boxes, Camera
+from calibslam_msgs_py.measurements import SECOND, Array, Boxes, Camera
 from calibslam_sim.box_noise import BoxConditions, BoxNoise
 from calibslam_sim.gross_errors import add_gross_errors
 from calibslam_sim.occlusion import hidden_shares
@@ -27,6 +27,7 @@ class Detector:
         min_size: neither does one whose box is narrower or lower [px].
         miss_rate: probability of missing an object that is easy to see; grows with what hides it.
         gross_share: share of boxes with a gross error, see `gross_errors`.
+        error_memory: time [s] in which the errors of an object's boxes become unlike by a factor of e, 0: independent.
     """
 
     noise: BoxNoise = field(default_factory=BoxNoise)
@@ -35,6 +36,7 @@ class Detector:
     min_size: float = 8.0
     miss_rate: float = 0.1
     gross_share: float = 0.0
+    error_memory: float = 0.0
 
     def detect(
         self,
@@ -67,7 +69,7 @@ class Detector:
             )
         )
         # Drawn for every object in every image, seen or not: what is seen does not shift anybody's numbers.
-        draws = stream(seed, "box noise").standard_normal(visible.shape)
+        draws = self._remembered(stream(seed, "box noise").standard_normal(visible.shape), times)
         luck = stream(seed, "missed boxes").random(hidden.shape)
         jitter = stream(seed, "scores").standard_normal(hidden.shape)
 
@@ -97,6 +99,16 @@ class Detector:
             boxes = add_gross_errors(boxes, self.gross_share, classes, gross)
             images.append(_cut_at_border(boxes, bounds))
         return images
+
+    def _remembered(self, draws: Array, times: np.ndarray) -> Array:
+        """Normal draws (F, ...) that are alike from image to image: an autoregressive process of first order."""
+        if self.error_memory == 0.0:
+            return draws
+        result = draws.copy()
+        for f, seconds in enumerate(np.diff(times) / SECOND, start=1):
+            kept = np.exp(-seconds / self.error_memory)
+            result[f] = kept * result[f - 1] + np.sqrt(1.0 - kept**2) * draws[f]
+        return result
 
 
 def _project_all(camera: Camera, world: tuple[WorldObject, ...], T_world_camera: Array) -> tuple[Array, Array]:

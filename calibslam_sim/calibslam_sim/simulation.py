@@ -37,6 +37,12 @@ class SimulationSettings(Settings):
     odometry_translation: float = setting(
         0.006, "standard deviation of the odometry's error per image, along each axis", unit="m", low=1e-6
     )
+    error_memory: float = setting(
+        0.0,
+        "time in which the errors of an object's boxes become unlike by a factor of e; 0: independent",
+        unit="s",
+        low=0.0,
+    )
     odometry_outliers: float = setting(
         0.0, "share of odometry steps that fail, with ten times the stated error", low=0.0, high=1.0
     )
@@ -82,7 +88,7 @@ def simulate(settings: SimulationSettings) -> Simulation:
     noise = OdometryNoise(
         settings.odometry_rotation, settings.odometry_translation, gross_share=settings.odometry_outliers
     )
-    detector = Detector(gross_share=settings.outliers)
+    detector = Detector(gross_share=settings.outliers, error_memory=settings.error_memory)
     return Simulation(
         camera=CAMERA,
         world=world,

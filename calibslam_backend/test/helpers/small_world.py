@@ -56,6 +56,7 @@ class SmallWorld:
         objects: what they see.
         rate: images per second.
         box_sigma: standard deviation of an edge [px].
+        box_memory: correlation of its error with that of the same object in the image before.
         rotation_sigma, translation_sigma: of a step of odometry, about and along each axis [rad, m].
         seed: of the noise.
     """
@@ -68,6 +69,7 @@ class SmallWorld:
     translation_sigma: float = 0.003
     seed: int = 0
     identities: bool = True
+    box_memory: float = 0.0
 
     @property
     def stamps(self) -> list[int]:
@@ -81,12 +83,15 @@ class SmallWorld:
     def boxes(self) -> list[Boxes]:
         """Of each image."""
         rng = np.random.default_rng([self.seed, 1])
+        error = rng.normal(size=(len(self.objects), 4))
         result = []
         for stamp, T in zip(self.stamps, self.poses, strict=True):
             T_camera_object = np.linalg.inv(T) @ np.stack([o.T_world_object for o in self.objects])
             radii = np.stack([o.radii for o in self.objects])
             exact = project(T_camera_object, radii, CAMERA.K, image_bounds(CAMERA.width, CAMERA.height))
-            noisy = exact + self.box_sigma * rng.normal(size=exact.shape)
+            noisy = exact + self.box_sigma * error
+            fresh = rng.normal(size=exact.shape)
+            error = self.box_memory * error + np.sqrt(1.0 - self.box_memory**2) * fresh
             on_border = (exact == 0.0) | (exact == [640.0, 480.0, 640.0, 480.0])
             noisy = np.where(on_border, exact, np.clip(noisy, 0.0, [640.0, 480.0, 640.0, 480.0]))
             size = noisy[:, 2:] - noisy[:, :2]

@@ -136,7 +136,8 @@ def _correlation(seen: Sightings) -> str:
     if np.isnan(found):
         return ""
     return (
-        f"Errors of an object's boxes in neighbouring keyframes correlate by {found:.2f}; the graph takes that for 0."
+        f"Errors of an object's boxes in neighbouring keyframes correlate by {found:.2f}: a row of them says less than "
+        "their number, which the graph allows for unless --no-box-correlation is given."
     )
 
 
