@@ -341,7 +341,7 @@ class ObjectGraph:
     def _learn_correlation(self, boxes: list[tuple[str, int, int]], residuals: Array) -> None:
         """From the residuals (N, 4) of these boxes and of those of the same quadrics in the keyframes before."""
         for (_, k, j), residual in zip(boxes, residuals, strict=True):
-            self.landmarks[j].residuals[k] = residual
+            self.landmarks[j].residuals[k] = residual.copy()  # a view would keep those of all alive
         rows = [n for n, (_, k, j) in enumerate(boxes) if k - 1 in self.landmarks[j].residuals]
         if rows:
             before = np.stack([self.landmarks[j].residuals[k - 1] for _, k, j in (boxes[n] for n in rows)])
