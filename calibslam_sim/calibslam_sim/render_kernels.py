@@ -17,6 +17,7 @@ WALL_X, WALL_Y, FLOOR, CEILING, TABLE, TABLE_SIDE = -1, -2, -3, -4, -5, -6
 PATTERNS = ("mottled", "bands", "stripes", "checks", "dots", "pot", "marble", "label", "screen", "keys")
 MOTTLED, BANDS, STRIPES, CHECKS, DOTS, POT, MARBLE, LABEL, SCREEN, KEYS = range(len(PATTERNS))
 TEXELS = 96  # per metre of a texture of the room
+NO_SHADOW = 1.5  # squared distance, in the coordinates of the unit sphere, from where the lamp is seen whole
 NOISE_SIZE = 32  # cells of the periodic noise in each direction
 
 
@@ -160,6 +161,15 @@ def _shares(pattern, q, frequency, phase, lattice):  # type: ignore[no-untyped-d
 
 
 @numba.njit(cache=True)
+def _squared_distance(a, b, c):  # type: ignore[no-untyped-def]
+    """Of a point c (3,) from the line between a and b (3,)."""
+    dx, dy, dz = b[0] - a[0], b[1] - a[1], b[2] - a[2]
+    x, y, z = c[0] - a[0], c[1] - a[1], c[2] - a[2]
+    along = min(max((x * dx + y * dy + z * dz) / (dx * dx + dy * dy + dz * dz), 0.0), 1.0)
+    return (x - along * dx) ** 2 + (y - along * dy) ** 2 + (z - along * dz) ** 2
+
+
+@numba.njit(cache=True)
 def cast_shadows(height, room, lamp, centres, whitening, share):  # type: ignore[no-untyped-def]
     """Share (S, S) of the lamp's light that reaches the plane at this height past the ellipsoids, with soft borders.
 
@@ -167,8 +177,10 @@ def cast_shadows(height, room, lamp, centres, whitening, share):  # type: ignore
     """
     size = share.shape[0]
     lamps = np.empty_like(centres)
+    reach = np.empty(len(centres))  # squared distance beyond which an ellipsoid takes no light away, with its borders
     for n in range(len(centres)):
         lamps[n] = whitening[n] @ (lamp - centres[n])
+        reach[n] = 1.001 * NO_SHADOW / np.min(np.sum(whitening[n] ** 2, axis=1))
     p = np.empty(3)
     for i in range(size):
         for j in range(size):
@@ -177,13 +189,15 @@ def cast_shadows(height, room, lamp, centres, whitening, share):  # type: ignore
             p[2] = height
             left = 1.0
             for n in range(len(centres)):
+                if _squared_distance(p, lamp, centres[n]) > reach[n]:
+                    continue
                 # Where is the line from here to the lamp nearest to the ellipsoid, and how near?
                 o = whitening[n] @ (p - centres[n])
                 d = lamps[n] - o
                 along = min(max(-(o @ d) / (d @ d), 0.0), 1.0)
                 o += along * d
                 squared = o @ o
-                if squared < 1.5:
+                if squared < NO_SHADOW:
                     left *= max((squared - 0.7) / 0.8, 0.0)
             share[i, j] = left
 

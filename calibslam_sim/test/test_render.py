@@ -18,7 +18,7 @@ from calibslam_sim import render_dataset, simulate, topics
 from calibslam_sim.camera_path import START
 from calibslam_sim.coco_writer import CLASSES
 from calibslam_sim.render import SAME_EDGE, Renderer
-from calibslam_sim.render_kernels import cast, visible_parts
+from calibslam_sim.render_kernels import cast, cast_shadows, visible_parts
 from calibslam_sim.render_looks import FAMILIAR, FAMILIES, FOREIGN
 from calibslam_sim.simulation import CAMERA
 from calibslam_sim.world import desk_world
@@ -59,6 +59,25 @@ def test_the_nearer_sphere_hides_the_other() -> None:
     assert boxes[0, 2] == pytest.approx(80 + np.sqrt(20.4**2 - 10.0**2), abs=1.0)
 
 
+def test_shadows_on_the_floor_are_those_of_all_ellipsoids() -> None:
+    """Against every line to the lamp past every ellipsoid: dark below 0.7 of squared distance, light above 1.5."""
+    world, room, lamp = desk_world(1), np.array([-4.0, -4.0, 0.0, 4.0, 4.0, 3.0]), np.array([0.5, 1.0, 2.9])
+    centres = np.array([o.ellipsoid.T_world_object[:3, 3] for o in world])
+    whitening = np.array([o.ellipsoid.T_world_object[:3, :3].T / o.ellipsoid.radii[:, None] for o in world])
+    share = np.empty((60, 60), np.float32)
+    cast_shadows(0.0, room, lamp, centres, whitening, share)
+    steps = (np.arange(60) + 0.5) / 60 * 8.0 - 4.0
+    points = np.stack([*np.meshgrid(steps, steps), np.zeros((60, 60))], axis=-1)
+    expected = np.ones((60, 60))
+    for centre, W in zip(centres, whitening, strict=True):
+        start, end = (points - centre) @ W.T, W @ (lamp - centre)
+        along = np.clip(np.sum(start * (start - end), axis=-1) / np.sum((end - start) ** 2, axis=-1), 0.0, 1.0)
+        squared = np.sum((start + along[..., None] * (end - start)) ** 2, axis=-1)
+        expected *= np.clip((squared - 0.7) / 0.8, 0.0, 1.0)
+    np.testing.assert_allclose(share, expected, atol=1e-6)
+    assert (expected == 0.0).sum() > 10 < ((expected > 0.0) & (expected < 1.0)).sum()
+
+
 def test_the_same_seed_gives_the_same_image() -> None:
     world = desk_world(3)
     first, second = (Renderer(world, SMALL, 3, 1.0, "familiar").render(START) for _ in range(2))
@@ -90,8 +109,9 @@ def test_an_object_is_drawn_in_its_box() -> None:
     without = tuple(
         replace(thing, ellipsoid=Ellipsoid(gone, thing.ellipsoid.radii)) if thing.id == k else thing for thing in world
     )
+    renderers = [Renderer(w, CAMERA, 0, 1.0, "familiar") for w in (world, without)]
     for second in range(0, 50, 5):
-        images = [Renderer(w, CAMERA, 0, 1.0, "familiar").render(START + second * SECOND) for w in (world, without)]
+        images = [renderer.render(START + second * SECOND) for renderer in renderers]
         if images[0].visible_shares[k] == 1.0 and images[0].in_image_shares[k] == 1.0:
             break
     difference = np.abs(images[0].image.astype(int) - images[1].image).max(axis=2) > 40
