@@ -250,3 +250,24 @@ def test_qos_overrides(name: str, outputs: list[str], graph: Watcher) -> None:
     for output in outputs:
         for policy in ("depth", "durability", "history", "reliability"):
             assert f"qos_overrides.{output}.publisher.{policy}" in names
+
+
+@pytest.mark.parametrize("node", sorted(NODES.keys() - {"record"}))
+def test_security_policy(graph: Watcher, node: str) -> None:
+    """`docs/policy.xml` allows what a node does, and nothing else but what depends on its settings and on tf2."""
+    profile = ElementTree.parse(PROJECT / "docs" / "policy.xml").find(f".//enclave[@path='/calibslam/{node}']//profile")
+    assert profile is not None and (profile.get("ns"), profile.get("node")) == ("/", node)
+    depends = {"/clock", "/tf", "/odom", "/ground_truth"}
+    for kind, rule, ask in (
+        ("topic", "publish", graph.node.get_publisher_names_and_types_by_node),
+        ("topic", "subscribe", graph.node.get_subscriber_names_and_types_by_node),
+        ("service", "reply", graph.node.get_service_names_and_types_by_node),
+    ):
+        names = [element.text or "" for element in profile.findall(f"{kind}s[@{rule}='ALLOW']/{kind}")]
+        allowed = {name.replace("~", f"/{node}") if name[0] in "/~" else f"/{name}" for name in names}
+
+        def used(ask: Any = ask) -> set[str]:
+            return {name for name, _ in ask(node, "/")}
+
+        wait_until(lambda a=allowed, u=used: a - depends <= u(), lambda u=used: f"{node}: {sorted(u())}")
+        assert used() <= allowed

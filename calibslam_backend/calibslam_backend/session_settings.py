@@ -20,7 +20,7 @@ class SessionSettings(TimeSettings):
         1000, "images that may wait for odometry; the latest ones beyond are dropped", low=1
     )
     max_keyframes: int = setting(
-        10_000,
-        "of a trajectory, which bounds memory; then a new one begins where it ends, with the objects there are",
+        5000,
+        "of a trajectory, which bounds memory and time; then a new one begins where it ends, in the map there is",
         low=10,
     )
