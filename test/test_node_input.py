@@ -14,6 +14,7 @@ from calibslam_msgs.msg import BoundingBox, BoundingBoxArray, RelativePose
 from calibslam_msgs.srv import LoadMap, SaveMap
 from live import Process, Watcher, random_domain, trajectory_of, wait_until
 from nav_msgs.msg import Path as PathMessage
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import CameraInfo
 from small_world import CAMERA, SmallWorld, around, objects
 from std_srvs.srv import SetBool, Trigger
@@ -21,11 +22,13 @@ from std_srvs.srv import SetBool, Trigger
 from calibslam_backend.metrics import ate
 from calibslam_msgs_py.conversions import RosTypes, boxes_to_msg, camera_to_msg, motion_to_msg
 from calibslam_msgs_py.measurements import SECOND, Boxes, Camera, RelativeMotion
-from calibslam_msgs_py.node import LATCHED, MEASUREMENT
+from calibslam_msgs_py.node import LATCHED
 
 WORLD = SmallWorld(around(150), objects())
 TYPES = RosTypes()
-PACE = 0.004  # [s] between messages: faster than any camera, slow enough for a queue of 100
+PACE = 0.004  # [s] between messages: faster than any camera
+# All of it is kept for a back end that has no time to take it in, or has not yet heard of its publisher.
+KEPT = QoSProfile(depth=1000, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.VOLATILE)
 
 
 class Robot:
@@ -34,8 +37,8 @@ class Robot:
     def __init__(self, watcher: Watcher) -> None:
         self.watcher = watcher
         self._camera = watcher.node.create_publisher(CameraInfo, "camera/camera_info", LATCHED)
-        self._boxes = watcher.node.create_publisher(BoundingBoxArray, "detections", MEASUREMENT)
-        self._motions = watcher.node.create_publisher(RelativePose, "relative_pose", MEASUREMENT)
+        self._boxes = watcher.node.create_publisher(BoundingBoxArray, "detections", KEPT)
+        self._motions = watcher.node.create_publisher(RelativePose, "relative_pose", KEPT)
         watcher.listen(PathMessage, "/trajectory")
         for publisher in (self._camera, self._boxes, self._motions):
             wait_until(lambda p=publisher: p.get_subscription_count() == 1, "the back end does not subscribe")
@@ -137,8 +140,8 @@ def test_bad_input_is_counted_and_the_graph_goes_on(robot: Robot) -> None:
 def test_a_peer_that_publishes_garbage(robot: Robot) -> None:
     """Bytes that are no message, far too many boxes, names that are none, another camera: counted, and nothing more."""
     boxes, motions = WORLD.boxes(), WORLD.motions()
-    peer = robot.watcher.node.create_publisher(BoundingBoxArray, "detections", MEASUREMENT)
-    other = robot.watcher.node.create_publisher(RelativePose, "relative_pose", MEASUREMENT)
+    peer = robot.watcher.node.create_publisher(BoundingBoxArray, "detections", KEPT)
+    other = robot.watcher.node.create_publisher(RelativePose, "relative_pose", KEPT)
     for publisher in (peer, other):
         wait_until(lambda p=publisher: p.get_subscription_count() == 1, "the back end does not subscribe")
     robot.camera()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 import numpy as np
 import plane_scene
@@ -63,10 +63,16 @@ def test_images_and_depth_become_motions(live: tuple[Watcher, Process]) -> None:
     def rejected(reason: str) -> bool:
         return int(counts().get(f"rejected_{reason}", 0)) > 0
 
-    send(1)
-    wait_until(lambda: rejected("no_camera"), lambda: f"{counts()} {process.output}")
-    publishers["camera_info"].publish(camera_to_msg(plane_scene.CAMERA, 0, TYPES))
-    time.sleep(0.5)
+    def hears(reason: str, publish: Callable[[], None]) -> bool:
+        """Published again and again: it may not have heard of its new publishers yet."""
+        publish()
+        time.sleep(0.2)
+        return rejected(reason)
+
+    wait_until(lambda: hears("no_camera", lambda: send(1)), lambda: f"{counts()} {process.output}")
+    camera = publishers["camera_info"]
+    wait_until(lambda: hears("camera", lambda: camera.publish(CameraInfo())), lambda: f"{counts()} {process.output}")
+    camera.publish(camera_to_msg(plane_scene.CAMERA, 0, TYPES))
     # Each only when the one before is done: none is dropped.
     for k in range(2, 8):
         send(k)
