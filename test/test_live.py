@@ -14,7 +14,7 @@ import pytest
 from calibslam_msgs.msg import QuadricArray
 from calibslam_msgs.srv import LoadMap, SaveMap
 from geometry_msgs.msg import PoseWithCovarianceStamped
-from live import Process, Watcher, random_domain, trajectory_of, wait_until
+from live import Process, Watcher, keeping_all, random_domain, trajectory_of, wait_until
 from nav_msgs.msg import Path as PathMessage
 from visualization_msgs.msg import MarkerArray
 
@@ -83,7 +83,7 @@ def live(bag: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Live]:
                for p in ("--wait-for", f"{t}:{n}")]  # fmt: skip
     with (
         Watcher(domain) as watcher,
-        Process(domain, "calibslam_sim", "odometry") as odometry,
+        Process(domain, "calibslam_sim", "odometry", *keeping_all("/relative_pose")) as odometry,
         Process(domain, "calibslam_backend", "backend", *backends[0]) as one,
         Process(domain, "calibslam_backend", "backend", *backends[1]) as other,
     ):

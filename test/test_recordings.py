@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from live import Process, Watcher, random_domain, trajectory_of, wait_until
+from live import Process, Watcher, keeping_all, random_domain, trajectory_of, wait_until
 from nav_msgs.msg import Path as PathMessage
 
 from calibslam_backend import slam_bag
@@ -102,8 +102,8 @@ def test_live_equals_offline(
     domain = random_domain()
     with (
         Watcher(domain) as watcher,
-        Process(domain, "calibslam_sim", "odometry") as odometry,
-        Process(domain, "calibslam_detector", "calibrator") as calibrator,
+        Process(domain, "calibslam_sim", "odometry", *keeping_all("/relative_pose")) as odometry,
+        Process(domain, "calibslam_detector", "calibrator", *keeping_all("/detections")) as calibrator,
         Process(domain, "calibslam_backend", "backend") as backend,
     ):
         watcher.listen(PathMessage, "/trajectory")

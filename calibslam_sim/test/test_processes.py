@@ -10,12 +10,13 @@ import pytest
 
 from calibslam_sim.processes import ProcessFailed, ProcessGroup
 
-SLEEP = ["-n", "1", "-r", "1", "import os, time; print(os.getpid(), flush=True); time.sleep(60)"]
+PATIENCE = 120.0  # [s] for what takes a second on an idle machine
+SLEEP = ["-n", "1", "-r", "1", "import os, time; print(os.getpid(), flush=True); time.sleep(300)"]
 
 
 def started(log: Path) -> int:
     """Process id that a sleeper has written."""
-    end = time.monotonic() + 20.0
+    end = time.monotonic() + PATIENCE
     while not log.exists() or not log.read_text().strip():
         assert time.monotonic() < end
         time.sleep(0.05)
@@ -45,14 +46,14 @@ def test_one_that_dies_is_reported_with_its_log(tmp_path: Path) -> None:
         processes.start("sleeper", "timeit", SLEEP)
         processes.start("victim", "json.tool", [str(tmp_path / "nowhere.json")])
         with pytest.raises(ProcessFailed, match=r"victim ended with [12](.|\n)*nowhere\.json"):
-            processes.wait("sleeper", 20.0)
+            processes.wait("sleeper", PATIENCE)
 
 
 def test_one_that_ends_well_is_done_with(tmp_path: Path) -> None:
     with ProcessGroup(tmp_path, {"WORD": "hello"}) as processes:
         processes.start("sleeper", "timeit", SLEEP)
         processes.start("quick", "timeit", ["-n", "1", "-r", "1", "import os; print(os.environ['WORD'])"])
-        processes.wait("quick", 20.0)
+        processes.wait("quick", PATIENCE)
         assert processes.is_running("sleeper")
     assert "hello" in (tmp_path / "quick.log").read_text()
 

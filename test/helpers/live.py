@@ -50,6 +50,11 @@ def executable(package: str, name: str) -> Path:
     raise FileNotFoundError(f"{package} {name} is not installed")
 
 
+def keeping_all(topic: str) -> list[str]:
+    """Arguments for a node that publishes this: nothing gets lost where a subscriber is busy for some seconds."""
+    return ["--ros-args", "-p", f"qos_overrides.{topic}.publisher.depth:=5000"]
+
+
 class Process:
     """An installed executable in a DDS domain; a context manager that does not let it outlive the test."""
 
