@@ -16,8 +16,6 @@ from calibslam_detector.calibration.residuals import CalibrationError, bounded_v
 
 SEED = 3
 
-pytestmark = pytest.mark.usefixtures("one_thread")
-
 
 def generator(seed: int = SEED) -> torch.Generator:
     return torch.Generator().manual_seed(seed)

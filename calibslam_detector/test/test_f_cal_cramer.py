@@ -18,8 +18,6 @@ from calibslam_detector.calibration.f_cal_cramer import FCalCramer, chi_squared_
 from calibslam_detector.calibration.losses import Blend, GaussianNLL
 from calibslam_detector.calibration.residuals import CalibrationError
 
-pytestmark = pytest.mark.usefixtures("one_thread")
-
 
 def generator(seed: int = 0) -> torch.Generator:
     return torch.Generator().manual_seed(seed)

@@ -13,8 +13,6 @@ from calibslam_detector.regressions.tasks import BLURS, LABEL_SIGMA_PER_BLUR, SI
 
 SMALL = RegressionSettings(degrees=20, sums=50, batch=60, steps=20, size=0.1, effort=0.1)
 
-pytestmark = pytest.mark.usefixtures("one_thread")
-
 
 def test_curve_has_the_noise_it_says() -> None:
     samples = curve(20000, torch.Generator().manual_seed(0))
