@@ -78,7 +78,8 @@ class DataAssociation:
         known = [(self._graph.quadric(j), box) for j, box in self._assignments.bound(frame)]
         s = self.settings
         quadrics, boxes = [vector for vector, _ in known], [box for _, box in known]
-        return localise(predicted, covariance, quadrics, boxes, self.camera.K, s.robust_scale, s.robust_odometry)
+        scales = s.robust_scale, s.robust_odometry
+        return localise(predicted, covariance, quadrics, boxes, self.camera.K, *scales, self._graph.correlation.worth)
 
     def innovations(self, frame: Frame, predicted: Array, covariance: Array) -> Array:
         """Normalised innovations squared of the boxes of bound tracks; arguments as in `localise`."""

@@ -32,6 +32,7 @@ def localise(
     K: Array,
     robust_scale: float,
     robust_odometry: float,
+    worth: float = 1.0,
 ) -> Array:
     """Pose (4, 4) of the camera in the map.
 
@@ -42,11 +43,12 @@ def localise(
         boxes: their N boxes.
         K: (3, 3) camera matrix [px].
         robust_scale, robust_odometry: as in the factor graph.
+        worth: share of the boxes' log-likelihood that counts, see `BoxCorrelation`.
     """
     if not boxes:
         return predicted
     whitener = np.linalg.inv(np.linalg.cholesky(covariance))
-    seen = _Seen(np.stack(quadrics), boxes, K, robust_scale)
+    seen = _Seen(np.stack(quadrics), boxes, K, robust_scale, worth)
     first = gtsam.Pose3(predicted)
     _, guess = _minimise(first, first, whitener / DISTRUST, NEVER_DOUBTED, seen)
     results = [_minimise(start, first, whitener, robust_odometry, seen) for start in (first, guess)]
@@ -63,13 +65,16 @@ def fit(start: Array, quadrics: list[Array], boxes: list[BoxMeasurement], K: Arr
 class _Seen:
     """Quadrics and their boxes as arrays."""
 
-    def __init__(self, vectors: Array, boxes: list[BoxMeasurement], K: Array, robust_scale: float) -> None:
+    def __init__(
+        self, vectors: Array, boxes: list[BoxMeasurement], K: Array, robust_scale: float, worth: float = 1.0
+    ) -> None:
         self._measured = stacked(boxes)
-        self._vectors, self._K, self._robust_scale = vectors, K, robust_scale
+        self._vectors, self._K, self._robust_scale, self._worth = vectors, K, robust_scale, worth
 
     def add(self, pose: gtsam.Pose3, H: Array, g: Array) -> float:
         """Robust cost of the boxes at a pose; adds their normal equations to H (6, 6) and g (6,)."""
-        cost: float = _boxes(pose.matrix(), self._vectors, self._K, *self._measured, self._robust_scale, H, g)
+        scale, worth = self._robust_scale, self._worth
+        cost: float = _boxes(pose.matrix(), self._vectors, self._K, *self._measured, scale, worth, H, g)
         return cost
 
 
@@ -95,15 +100,15 @@ def _minimise(
 
 
 @numba.njit(cache=True)
-def _boxes(T, vectors, K, corners, whiteners, bounds, clip, k, H, g):  # type: ignore[no-untyped-def]
+def _boxes(T, vectors, K, corners, whiteners, bounds, clip, k, worth, H, g):  # type: ignore[no-untyped-def]
     """Robust cost of the boxes; adds their normal equations to H (6, 6) and g (6,)."""
     cost = 0.0
     for n in range(len(vectors)):
         visible, r, dr = whitened_residual(T, vectors[n], K, corners[n], whiteners[n], bounds[n], clip[n])
         rho, weight = robust_loss(r @ r if visible else INVISIBLE**2, k)
-        cost += rho
+        cost += worth * rho
         if visible:
             J = np.ascontiguousarray(dr[:, :6])
-            H += weight * (J.T @ J)
-            g -= weight * (J.T @ r)
+            H += worth * weight * (J.T @ J)
+            g -= worth * weight * (J.T @ r)
     return cost
