@@ -127,7 +127,10 @@ def class_costs(classes: Sequence[Counter[str]], class_id: str, wrong_class: flo
 def distances(
     predictions: list[Prediction], boxes: list[BoxMeasurement], classes: list[str], settings: AssociationSettings
 ) -> Array:
-    """Negative log-likelihood (landmarks, boxes) of a pair; infinite outside the gate."""
+    """Negative log-likelihood (landmarks, boxes) of a pair; infinite outside the gate.
+
+    Also where a box of some new object is more likely: a prediction that is vague enough lets anything through the gate.
+    """
     gate = gate_of(settings.gate)
     result = np.full((len(predictions), len(boxes)), np.inf)
     for b, box in enumerate(boxes):
@@ -139,8 +142,19 @@ def distances(
             squared = difference @ np.linalg.solve(S, difference)
             if squared < gate:
                 class_odds = 0.0 if prediction.class_id == classes[b] else -np.log(settings.wrong_class)
-                result[p, b] = 0.5 * (squared + np.linalg.slogdet(S)[1]) + class_odds
+                cost = 0.5 * (squared + np.linalg.slogdet(S)[1]) + class_odds
+                if cost < new_object_cost(box.bounds, settings.wrong_class):
+                    result[p, b] = cost
     return result
+
+
+def new_object_cost(bounds: Array, wrong_class: float) -> float:
+    """Cost, as in `distances`, of a box of an object that is not in the map.
+
+    It may be any box of the image, bounds (4,) [px], and its class is no likelier than a wrong one.
+    """
+    width, height = bounds[2:] - bounds[:2]
+    return float(np.log(width**2 / 2.0 * height**2 / 2.0) - 2.0 * np.log(2.0 * np.pi) - np.log(wrong_class))
 
 
 def assign(cost: Array) -> list[tuple[int, int]]:

@@ -20,6 +20,7 @@ from calibslam_backend.association import (
     at_one_place,
     class_costs,
     distances,
+    new_object_cost,
     predict,
     same_object,
     unambiguous,
@@ -120,6 +121,17 @@ def test_the_surer_landmark_is_not_always_the_nearer_one() -> None:
     vague = Prediction(1, corners, np.eye(4) * 400.0, "cup")
     cost = distances([sure, vague], [box(corners)], ["cup"], AssociationSettings())
     assert cost[0, 0] < cost[1, 0]
+
+
+def test_what_is_too_vague_may_as_well_be_new() -> None:
+    """Boxes of a 640 x 480 image: 640^2 / 2 pairs of left and right edges, 480^2 / 2 of upper and lower ones."""
+    new = np.log(204_800.0 * 115_200.0) - 2.0 * np.log(2.0 * np.pi) - np.log(0.05)
+    assert new_object_cost(BOUNDS, 0.05) == pytest.approx(new)
+    corners, settings = np.array([200.0, 150.0, 330.0, 260.0]), AssociationSettings(wrong_class=0.05)
+    for factor, expected in ((0.99, True), (1.01, False)):
+        variance = np.exp(factor * new / 2.0)  # the cost of a box right there is log(variance^4) / 2
+        prediction = Prediction(0, corners, np.eye(4) * variance - COVARIANCE, "cup")
+        assert np.isfinite(distances([prediction], [box(corners)], ["cup"], settings)[0, 0]) == expected
 
 
 def test_the_cheapest_assignment_of_all() -> None:

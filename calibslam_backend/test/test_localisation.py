@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import gtsam
 import numpy as np
 from small_world import CAMERA, SmallWorld, around, objects
@@ -93,3 +95,14 @@ def test_a_quadric_behind_the_camera_is_survived() -> None:
     backwards = POSES[0].copy()
     backwards[:3, :3] = backwards[:3, :3] @ np.diag([-1.0, 1.0, -1.0])
     assert np.isfinite(find(backwards, boxes_at(0))).all()
+
+
+def test_boxes_count_by_their_worth() -> None:
+    """A quarter of it is twice the deviation, where nothing is doubted."""
+    predicted, boxes = off(POSES[3], [0.01, -0.01, 0.01, 0.01, 0.01, -0.01]), boxes_at(3)
+    wider = [replace(box, whitener=0.5 * box.whitener) for box in boxes]
+    less = localise(predicted, COVARIANCE, VECTORS, boxes, CAMERA.K, 1e6, 1e6, worth=0.25)
+    np.testing.assert_allclose(less, localise(predicted, COVARIANCE, VECTORS, wider, CAMERA.K, 1e6, 1e6), atol=1e-9)
+    assert error(less, predicted) < error(
+        localise(predicted, COVARIANCE, VECTORS, boxes, CAMERA.K, 1e6, 1e6), predicted
+    )
