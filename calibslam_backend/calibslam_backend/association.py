@@ -129,7 +129,7 @@ def distances(
 ) -> Array:
     """Negative log-likelihood (landmarks, boxes) of a pair; infinite outside the gate.
 
-    Also where a box of some new object is more likely: a prediction that is vague enough lets anything through the gate.
+    Also where a box of some new object is likelier: a prediction that is vague enough lets anything through the gate.
     """
     gate = gate_of(settings.gate)
     result = np.full((len(predictions), len(boxes)), np.inf)

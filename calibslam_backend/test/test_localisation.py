@@ -101,8 +101,9 @@ def test_boxes_count_by_their_worth() -> None:
     """A quarter of it is twice the deviation, where nothing is doubted."""
     predicted, boxes = off(POSES[3], [0.01, -0.01, 0.01, 0.01, 0.01, -0.01]), boxes_at(3)
     wider = [replace(box, whitener=0.5 * box.whitener) for box in boxes]
-    less = localise(predicted, COVARIANCE, VECTORS, boxes, CAMERA.K, 1e6, 1e6, worth=0.25)
-    np.testing.assert_allclose(less, localise(predicted, COVARIANCE, VECTORS, wider, CAMERA.K, 1e6, 1e6), atol=1e-9)
-    assert error(less, predicted) < error(
-        localise(predicted, COVARIANCE, VECTORS, boxes, CAMERA.K, 1e6, 1e6), predicted
-    )
+
+    def found(boxes: list[BoxMeasurement], worth: float = 1.0) -> Array:
+        return localise(predicted, COVARIANCE, VECTORS, boxes, CAMERA.K, 1e6, 1e6, worth)
+
+    np.testing.assert_allclose(found(boxes, worth=0.25), found(wider), atol=1e-9)
+    assert error(found(wider), predicted) < error(found(boxes), predicted)
