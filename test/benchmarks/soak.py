@@ -1,10 +1,11 @@
 """The back end under load and among faults: many boxes, a consumer that stops reading, a peer that publishes garbage.
 
-    ./calibslam shell -c 'python test/benchmarks/soak.py [--minutes 10] [--rate 60] [--boxes 40]'
+    ./calibslam shell -c 'python test/benchmarks/soak.py [--minutes 10] [--rate 60] [--boxes 40] [--max-keyframes 400]'
 
 A camera goes round and round a floor with objects. After a third of the time a subscriber of all maps stops reading;
 all the time another node publishes what no node should. Each line states what came, what was left out, and memory; at
-the end every image that was sent must be accounted for, and the growth of memory per keyframe is stated.
+the end every image that was sent must be accounted for; stated are the growth of memory per keyframe, and the most in
+each trajectory (`max_keyframes`), which must not grow.
 """
 
 from __future__ import annotations
@@ -132,11 +133,13 @@ def main() -> int:
     parser.add_argument("--rate", type=float, default=60.0, help="images per second (default: 60)")
     parser.add_argument("--boxes", type=int, default=40, help="objects in view (default: 40)")
     parser.add_argument("--queue-size", type=int, default=10_000, help="parameter of the back end (default: 10000)")
+    parser.add_argument("--max-keyframes", type=int, default=400, help="parameter of the back end (default: 400)")
     arguments = parser.parse_args()
     domain, stop = random_domain(), threading.Event()
     os.environ["ROS_DOMAIN_ID"] = str(domain)
-    rows: list[tuple[float, int, float]] = []
-    with Watcher(domain) as watcher, backend(domain, f"queue_size:={arguments.queue_size}") as process:
+    rows: list[tuple[int, int, float]] = []
+    limits = f"queue_size:={arguments.queue_size}", f"max_keyframes:={arguments.max_keyframes}"
+    with Watcher(domain) as watcher, backend(domain, *limits) as process:
         load = Load(watcher, arguments.rate, arguments.boxes)
         print(f"{load.boxes_per_image:.1f} boxes per image at {arguments.rate:g} Hz", flush=True)
         wait_until(lambda: watcher.counts("/backend"), lambda: process.output)
@@ -155,7 +158,8 @@ def main() -> int:
                     stuck.send_signal(signal.SIGSTOP)
                 counts = watcher.counts("/backend")
                 if "keyframes" in counts:
-                    rows.append((elapsed, int(counts["keyframes"]), float(counts["memory_mb"])))
+                    ended = int(counts.get("trajectories_ended", 0))
+                    rows.append((ended, int(counts["keyframes"]), float(counts["memory_mb"])))
                 print(line(elapsed, load.sent, counts, cpu_seconds(process.pid) / (elapsed + 1.0)), flush=True)
         finally:
             stop.set()
@@ -173,17 +177,32 @@ def main() -> int:
         print(line(time.monotonic() - began, load.sent, counts, 0.0))
         missing = load.sent - images_accounted(counts)
         print(f"sent {load.sent} images, {missing} of them not accounted for; all counts: {counts}")
-        half = rows[len(rows) // 2 :]
-        growth = np.polyfit([k for _, k, _ in half], [mb for _, _, mb in half], 1)[0] if len(half) > 2 else np.nan
-        print(
-            f"memory: {1024 * growth:.0f} KiB per keyframe in the second half, {counts['memory_peak_mb']} MiB at most"
-        )
+        print(memory(rows), f"{counts['memory_peak_mb']} MiB at most")
         code = process.end()
     return 0 if missing <= 0 and code == 0 else 1
 
 
+def memory(rows: list[tuple[int, int, float]]) -> str:
+    """Of trajectories ended, keyframes, and memory [MiB]: growth in the first trajectory, the most in each."""
+    first = [(k, mb) for ended, k, mb in rows if not ended]
+    growth = np.polyfit(*zip(*first, strict=True), 1)[0] if len(first) > 2 else np.nan
+    most = {ended: max(mb for e, _, mb in rows if e == ended) for ended, _, _ in rows}
+    each = ", ".join(f"{mb:.0f}" for mb in most.values())
+    return f"memory: {1024 * growth:.0f} KiB per keyframe in the first trajectory; the most in each: {each} MiB;"
+
+
 def line(elapsed: float, sent: int, counts: dict[str, str], cpu: float) -> str:
-    names = ("images", "keyframes", "objects", "queue", "update_ms_p50", "update_ms_p99", "delay_ms_p50", "memory_mb")
+    names = (
+        "images",
+        "keyframes",
+        "trajectories_ended",
+        "objects",
+        "queue",
+        "update_ms_p50",
+        "update_ms_p99",
+        "delay_ms_p50",
+        "memory_mb",
+    )
     values = ", ".join(f"{name} {counts.get(name)}" for name in names)
     left_out = {k: int(v) for k, v in counts.items() if k.startswith(("rejected", "lost", "errors"))}
     return f"{elapsed:5.0f} s: sent {sent}, {values}, cores {cpu:.2f}, left out {left_out}"
