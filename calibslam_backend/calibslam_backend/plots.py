@@ -66,17 +66,24 @@ def plot_run(path: Path, title: str, result: ObjectMap, odometry: Array, truth: 
 
 
 def _objects(axes: Axes, result: ObjectMap) -> None:
+    """Outlines and names; the legend names the first of each kind of ellipse, the others have names that it skips."""
+    outline, place = "object", f"{CONFIDENCE:g} sigma of its centre"
     for quadric in result.quadrics:
         R = quadric.T_map_object[:3, :3]
         shadow = (R * quadric.radii**2) @ R.T  # the outline from above is the ellipse of its upper left block
         centre = quadric.T_map_object[:2, 3]
-        axes.add_patch(_ellipse(centre, shadow[:2, :2], facecolor="tab:purple", alpha=0.25, edgecolor="tab:purple"))
+        axes.add_patch(
+            _ellipse(centre, shadow[:2, :2], label=outline, facecolor="tab:purple", alpha=0.25, edgecolor="tab:purple")
+        )
+        outline = "_"
         if np.isfinite(quadric.covariance).all():
             sigma = (R @ quadric.covariance[3:6, 3:6] @ R.T)[:2, :2] * CONFIDENCE**2
-            axes.add_patch(_ellipse(centre, sigma, fill=False, edgecolor="black", linewidth=0.8, linestyle="--"))
+            axes.add_patch(_ellipse(centre, sigma, label=place, fill=False, edgecolor="black", linewidth=0.8))
+            place = "_"
         axes.annotate(
-            quadric.class_id, (centre[0], centre[1]), fontsize=7, ha="center", va="center", annotation_clip=True
-        )
+            quadric.class_id, (centre[0], centre[1]), (0.0, 4.0), textcoords="offset points",
+            fontsize=7, ha="center", va="bottom", annotation_clip=True,
+        )  # fmt: skip
 
 
 def _ellipse(centre: Array, shape: Array, **style: object) -> Ellipse:

@@ -188,7 +188,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         boxes = demo_images.detect(bag, detected)
         demo_images.write_overlay(bag, detected, out / "overlay.png")
         say(f"{boxes} boxes, each with a covariance")
-        say("loading the back end; the first time it is compiled, which takes half a minute")
+        say("loading the back end")
         load_kernels()  # once, for all of them
         say(f"playing it at {arguments.rate:g} times its speed to odometry and {len(CONDITIONS)} back ends")
         for condition in CONDITIONS:
