@@ -22,31 +22,30 @@ class BoxCorrelation:
     """A running estimate from pairs of residuals.
 
     Attributes:
-        is_estimated: if not, errors are taken for independent.
+        worth: the share of a box's log-likelihood that counts, at most 1.
     """
 
     MEMORY = 3000.0  # pairs; earlier ones, of an estimate that was worse, fade
     DOUBT = 100.0  # pairs of boxes that show no correlation, to begin with
 
     def __init__(self, is_estimated: bool = True) -> None:
-        self.is_estimated = is_estimated
+        """Of nothing yet; if it is not to be estimated, errors are taken for independent."""
+        self._is_estimated = is_estimated
         self._products = 0.0
         self._squares = 0.0
+        self.worth = 1.0
 
     def learn(self, before: Array, now: Array) -> None:
         """Residuals (N, 4) and (N, 4) of the same objects' boxes in consecutive keyframes, in standard deviations."""
         fading = np.exp(-len(now) / self.MEMORY)
         self._products = fading * self._products + float(np.sum(before * now))
         self._squares = fading * self._squares + 0.5 * float(np.sum(before**2) + np.sum(now**2))
+        if self._is_estimated:
+            correlation = max(self.correlation, 0.0)
+            self.worth = (1.0 - correlation) / (1.0 + correlation)
 
     @property
     def correlation(self) -> float:
         """Of neighbours."""
         edges = 4.0
-        return self._products / (self._squares + self.DOUBT * edges)
-
-    @property
-    def worth(self) -> float:
-        """The share of a box's log-likelihood that counts, at most 1."""
-        correlation = max(self.correlation, 0.0) if self.is_estimated else 0.0
-        return (1.0 - correlation) / (1.0 + correlation)
+        return float(self._products / (self._squares + self.DOUBT * edges))

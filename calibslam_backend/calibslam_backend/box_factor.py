@@ -30,9 +30,10 @@ def whitened_residual(T_map_camera, quadric, K, corners, whitener, bounds, clip)
 
 
 @numba.njit(cache=True)
-def _weighted(T_map_camera, quadric, K, measured, k):  # type: ignore[no-untyped-def]
+def _weighted(T_map_camera, quadric, K, measured, k, worth):  # type: ignore[no-untyped-def]
     """(4, 17): columns of dr by the pose and by the quadric, r for the linearisation, r for the error; see `robust`.
 
+    All of a box that counts by its worth.
     One array, and one for all that was measured (`BoxMeasurement.packed`), since each that comes from or goes to Python
     takes as long as a tenth to a third of what is computed here.
     """
@@ -43,10 +44,11 @@ def _weighted(T_map_camera, quadric, K, measured, k):  # type: ignore[no-untyped
     if not visible:
         r[:] = 0.5 * INVISIBLE
     for_error, for_linearisation = robust_scales(r @ r, k)
+    scale = np.sqrt(worth)
     if visible:
-        result[:, :15] = for_linearisation * dr
-    result[:, 15] = for_linearisation * r
-    result[:, 16] = for_error * r
+        result[:, :15] = scale * for_linearisation * dr
+    result[:, 15] = scale * for_linearisation * r
+    result[:, 16] = scale * for_error * r
     return result
 
 
@@ -55,12 +57,11 @@ def _tangents(poses, quadrics, K, measured, k, worth):  # type: ignore[no-untype
     """(N, 17, 4) of N boxes: the transposed Jacobian by pose and quadric, minus the residual, and the residual of a box
     that counts fully."""
     result = np.empty((len(poses), 17, 4))
-    scale = np.sqrt(worth)
     for n in range(len(poses)):
-        weighted = _weighted(poses[n], quadrics[n], K, measured[n], k)
-        result[n, :15] = scale * weighted[:, :15].T
-        result[n, 15] = -scale * weighted[:, 15]
-        result[n, 16] = weighted[:, 15]
+        weighted = _weighted(poses[n], quadrics[n], K, measured[n], k, worth)
+        result[n, :15] = weighted[:, :15].T
+        result[n, 15] = -weighted[:, 15]
+        result[n, 16] = weighted[:, 15] / np.sqrt(worth)
     return result
 
 
@@ -90,7 +91,7 @@ def box_factor(
 
     def error(_: gtsam.CustomFactor, values: gtsam.Values, H: list[Array] | None) -> Array:
         T, vector = values.atPose3(pose).matrix(), values.atVector(quadric)
-        result: Array = np.sqrt(correlation.worth) * _weighted(T, vector, K, measured, robust_scale)
+        result: Array = _weighted(T, vector, K, measured, robust_scale, correlation.worth)
         if H is None:
             return result[:, 16]
         H[0], H[1] = result[:, POSE], result[:, QUADRIC]
