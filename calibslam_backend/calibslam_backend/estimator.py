@@ -108,7 +108,7 @@ class Estimator:
         self._chores: list[Callable[[], object]] = []
         self._searching = False
         self._sighting: tuple[int, Array] | None = None  # where a camera that searches was seen last
-        self._start: Array | None = None  # where it is said to be
+        self._start: tuple[Array, float] | None = None  # where it is said to be, and how far off that may be
         self._given: dict[str, int] = {}
         self._waiting: list[tuple[int, int, Boxes]] = []
         self._last_frame: int | None = None
@@ -277,8 +277,8 @@ class Estimator:
         known = tuple(self.quadrics()) if keep_map else ()
         self.load(ObjectMap((), np.zeros((0, 4, 4)), np.zeros((0, 6, 6)), known, self.camera.frame_id))
 
-    def start_at(self, T_map_body: Array) -> None:
-        """Begin a trajectory in the map there is, where the body is said to be: (4, 4), right to about half a metre.
+    def start_at(self, T_map_body: Array, error: float = START_ERROR) -> None:
+        """Begin a trajectory in the map there is, where the body is said to be (4, 4), within `error` [rad, m].
 
         Raises:
             InvalidMeasurement: "start_pose", if there is no map.
@@ -287,7 +287,7 @@ class Estimator:
             raise InvalidMeasurement("start_pose", "there is no map yet that a start pose could be in")
         if self.stamps:
             self.begin_again(keep_map=True)
-        self._start = T_map_body @ self._T_body_camera
+        self._start = T_map_body @ self._T_body_camera, error
 
     def associations(self) -> list[tuple[int | None, str]]:
         """For each box of a keyframe the quadric it is given to, and its true identity ("": unknown)."""
@@ -324,7 +324,7 @@ class Estimator:
         boxes, tracks = self._tracks(boxes, turned)
         motion = found = None
         if self._start is not None:
-            found, self._start, self._searching = self._near_start(boxes, tracks, self._start), None, False
+            found, self._start, self._searching = self._near_start(boxes, tracks, *self._start), None, False
         elif self._searching:
             found = self._find(boxes, tracks)
             if found is None:
@@ -414,12 +414,12 @@ class Estimator:
         if report.repaired:
             self._repairs.append(report.repaired)
 
-    def _near_start(self, boxes: Boxes, tracks: list[int], start: Array) -> Relocalised:
-        """Where the camera is found near the pose (4, 4) that it is said to have, or that pose."""
+    def _near_start(self, boxes: Boxes, tracks: list[int], start: Array, error: float) -> Relocalised:
+        """Where the camera is found, within `error` of the pose (4, 4) that it is said to have, or that pose."""
         found = self._objects.find(self._objects.frame(boxes, tracks))
         if found is not None:
             difference = gtsam.Pose3(start).localCoordinates(gtsam.Pose3(found.T_map_camera))
-            if np.abs(difference).max() < self.START_ERROR:
+            if np.abs(difference).max() < error:
                 return found
         return Relocalised(start, [])
 

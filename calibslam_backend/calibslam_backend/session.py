@@ -41,6 +41,8 @@ class Session:
         tally: what it counts and how long it takes.
     """
 
+    SINCE_KEYFRAME = 0.1  # [rad, m] that the body may have moved since the newest one
+
     def __init__(
         self,
         T_body_camera: Array,
@@ -210,7 +212,7 @@ class Session:
         self._report.count("trajectories_ended")
         self._report.say(f"{len(estimator.stamps)} keyframes (max_keyframes): a new trajectory begins in the map")
         if estimator.objects:
-            self._begin(lambda: estimator.start_at(estimator.body_pose()))
+            self._begin(lambda: estimator.start_at(estimator.body_pose(), self.SINCE_KEYFRAME))
         else:
             self._begin(lambda: estimator.begin_again(keep_map=False))
         gc.collect()  # a graph is in reference cycles
