@@ -129,26 +129,41 @@ def test_odometry_errs_as_much_as_it_says() -> None:
     assert low < np.sum(squares) < high
 
 
-def test_boxes_err_as_much_as_they_say() -> None:
-    simulation = short_run()
+def whitened_errors(simulation: Simulation) -> dict[tuple[int, str], Array]:
+    """(4,) of each box that does not come near the image border, where errors are cut, by image and object."""
     bounds = image_bounds(CAMERA.width, CAMERA.height)
-    squares, whitened = [], []
+    result = {}
     for k, boxes in enumerate(simulation.boxes):
         T_camera_world = np.linalg.inv(simulation.T_world_camera[k])
-        for i in range(len(boxes)):
-            ellipsoid = simulation.world[int(boxes.object_ids[i])].ellipsoid
+        for i, name in enumerate(boxes.object_ids):
+            ellipsoid = simulation.world[int(name)].ellipsoid
             truth = project(T_camera_world @ ellipsoid.T_world_object, ellipsoid.radii, CAMERA.K, bounds)[0]
-            sigma = np.sqrt(np.diag(boxes.covariances[i]))
-            if (np.abs(truth - bounds) < 5.0 * sigma).any():
-                continue  # near the border errors are cut
-            error = boxes.corners[i] - truth
-            squares.append(error @ np.linalg.solve(boxes.covariances[i], error))
-            whitened.append(np.linalg.solve(np.linalg.cholesky(boxes.covariances[i]), error))
-    assert len(squares) > 1000
+            if (np.abs(truth - bounds) >= 5.0 * np.sqrt(np.diag(boxes.covariances[i]))).all():
+                L = np.linalg.cholesky(boxes.covariances[i])
+                result[k, name] = np.linalg.solve(L, boxes.corners[i] - truth)
+    return result
+
+
+def test_boxes_err_as_much_as_they_say() -> None:
+    whitened = np.stack(list(whitened_errors(short_run()).values()))
+    assert len(whitened) > 1000
+    squares = np.sum(whitened**2, axis=1)
     low, high = stats.chi2.ppf([0.005, 0.995], 4 * len(squares))
     assert low < np.sum(squares) < high
     assert stats.kstest(squares, stats.chi2(4).cdf).pvalue > 0.01
-    np.testing.assert_allclose(np.cov(np.array(whitened).T), np.eye(4), atol=0.1)
+    np.testing.assert_allclose(np.cov(whitened.T), np.eye(4), atol=0.1)
+
+
+@pytest.mark.parametrize("memory", [0.0, 0.5])
+def test_errors_are_alike_for_as_long_as_they_are_said_to_be(memory: float) -> None:
+    """Images 0.1 s and 0.5 s apart; about 4,000 pairs of edges, of which those of one object say less: 0.1 allowed."""
+    errors = whitened_errors(simulate(SimulationSettings(duration=20.0, frame_rate=10.0, error_memory=memory)))
+    for images in (1, 5):
+        pairs = [(e, errors[k + images, name]) for (k, name), e in errors.items() if (k + images, name) in errors]
+        before, after = (np.concatenate(each) for each in zip(*pairs, strict=True))
+        expected = np.exp(-0.1 * images / memory) if memory else 0.0
+        assert np.corrcoef(before, after)[0, 1] == pytest.approx(expected, abs=0.1)
+        assert np.var(before) == pytest.approx(1.0, abs=0.15)
 
 
 def test_no_constant_describes_the_errors() -> None:
