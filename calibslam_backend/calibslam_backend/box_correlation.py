@@ -36,7 +36,12 @@ class BoxCorrelation:
         self.worth = 1.0
 
     def learn(self, before: Array, now: Array) -> None:
-        """Residuals (N, 4) and (N, 4) of the same objects' boxes in consecutive keyframes, in standard deviations."""
+        """Residuals (N, 4) and (N, 4) of the same objects' boxes in consecutive keyframes, in standard deviations.
+
+        Those that are not finite, of a state that is about to be repaired, teach nothing.
+        """
+        finite = np.isfinite(before).all(axis=1) & np.isfinite(now).all(axis=1)
+        before, now = before[finite], now[finite]
         fading = np.exp(-len(now) / self.MEMORY)
         self._products = fading * self._products + float(np.sum(before * now))
         self._squares = fading * self._squares + 0.5 * float(np.sum(before**2) + np.sum(now**2))

@@ -33,6 +33,17 @@ def test_by_hand() -> None:
     assert found.worth == pytest.approx((1.0 - 4.0 / 405.0) / (1.0 + 4.0 / 405.0))
 
 
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+def test_a_broken_state_teaches_nothing(value: float) -> None:
+    found, same = BoxCorrelation(), BoxCorrelation()
+    errors = autoregressive(0.5, 100, 2)
+    spoilt = errors.copy()
+    spoilt[:50, 0, 2] = value
+    found.learn(spoilt[:, 0], spoilt[:, 1])
+    same.learn(errors[50:, 0], errors[50:, 1])
+    assert found.worth == same.worth < 1.0
+
+
 @pytest.mark.parametrize("correlation", [0.0, 0.3, 0.8])
 def test_it_is_found(correlation: float) -> None:
     errors = autoregressive(correlation, 40, 200)
