@@ -171,8 +171,12 @@ def test_the_map_is_saved_at_the_end_and_started_in_where_told(tmp_path: Path) -
         start = watcher.node.create_publisher(PoseWithCovarianceStamped, "initialpose", 10)
         robot.wait(process)
         wait_until(lambda: start.get_subscription_count() == 1, "the back end does not subscribe")
-        robot.camera()
-        wait_until(lambda: watcher.call(LoadMap, "/backend/load_map", path="end/map.json").success, "not loaded")
+
+        def is_loaded() -> bool:
+            robot.camera()  # each time: a subscriber that has not found its publisher yet misses what is sent once
+            return bool(watcher.call(LoadMap, "/backend/load_map", path="end/map.json").success)
+
+        wait_until(is_loaded, "not loaded")
         start.publish(pose_with_covariance_to_msg(pose, None, "odom", TYPES))
         start.publish(pose_with_covariance_to_msg(pose, None, "map", TYPES))
         wait_until(lambda: "rejected_frame" in watcher.counts("/backend"), lambda: f"{watcher.counts('/backend')}")
