@@ -134,6 +134,7 @@ def distances(
     gate = gate_of(settings.gate)
     result = np.full((len(predictions), len(boxes)), np.inf)
     for b, box in enumerate(boxes):
+        limit = new_object_cost(box.bounds, settings.wrong_class)
         for p, prediction in enumerate(predictions):
             if overlap(prediction.corners[None], box.corners[None])[0, 0] < settings.min_overlap:
                 continue
@@ -143,7 +144,7 @@ def distances(
             if squared < gate:
                 class_odds = 0.0 if prediction.class_id == classes[b] else -np.log(settings.wrong_class)
                 cost = 0.5 * (squared + np.linalg.slogdet(S)[1]) + class_odds
-                if cost < new_object_cost(box.bounds, settings.wrong_class):
+                if cost < limit:
                     result[p, b] = cost
     return result
 

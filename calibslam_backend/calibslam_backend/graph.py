@@ -293,7 +293,8 @@ class ObjectGraph:
 
     def _step(self, solve: Callable[[], None]) -> UpdateReport:
         """Solve; what goes wrong is repaired and reported."""
-        before, poses = self._smoother.values, self.poses()
+        before = self._smoother.values
+        poses = self._poses(before)
         reason = ""
         try:
             solve()
@@ -369,7 +370,7 @@ class ObjectGraph:
         Returns how many.
         """
         s = self._settings
-        poses, worth = self.poses(), self.correlation.worth
+        poses, worth = self._poses(self._smoother.values), self.correlation.worth
         moved = np.abs(poses - self._linearised).max(axis=(1, 2)) > s.relinearise_pose
         names: dict[Hashable, None] = {}  # each once, in a fixed order
         for k in turn:
@@ -413,7 +414,7 @@ class ObjectGraph:
 
     def _jumped(self, old: Array) -> bool:
         """Whether a pose moved from where it was (N, 4, 4) farther than an undamped step can be trusted with."""
-        new = self.poses()
+        new = self._poses(self._smoother.values)
         moved = np.linalg.norm(new[:, :3, 3] - old[:, :3, 3], axis=1)
         # The norm of the difference of two rotations is 2 sqrt(2) sin(angle / 2).
         turned = np.linalg.norm(new[:, :3, :3] - old[:, :3, :3], axis=(1, 2)) / np.sqrt(2.0)
