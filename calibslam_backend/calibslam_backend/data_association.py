@@ -28,7 +28,7 @@ from calibslam_backend.association import (
 from calibslam_backend.box_measurement import BoxMeasurement, prepare
 from calibslam_backend.estimator_settings import EstimatorSettings
 from calibslam_backend.graph import ObjectGraph, UpdateReport
-from calibslam_backend.initialisation import initialise
+from calibslam_backend.initialisation import initialise_by_newest
 from calibslam_backend.innovation import innovations
 from calibslam_backend.localisation import localise
 from calibslam_backend.noise import NoiseModel, spread
@@ -243,7 +243,7 @@ class DataAssociation:
                 continue
             poses = np.stack([self._graph.pose(k) for k, _ in rows])
             boxes = [frames[k].boxes[n] for k, n in rows]
-            first = initialise(poses, boxes, self.camera.K, self.settings.robust_scale, self.settings)
+            first = initialise_by_newest(poses, boxes, self.camera.K, self.settings.robust_scale, self.settings)
             if first is None:
                 continue
             known = self._same_as(first.vector, candidate)

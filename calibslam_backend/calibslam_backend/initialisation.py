@@ -123,6 +123,22 @@ def initialise(
     return Initialised(vector, covariance, distances)
 
 
+def initialise_by_newest(
+    poses: Array, boxes: list[BoxMeasurement], K: Array, robust_scale: float, settings: InitialisationSettings
+) -> Initialised | None:
+    """As `initialise`, of N boxes in the order of time, or of the newer half of them, or of the newer half of that ...
+
+    Odometry that drifts fast soon contradicts the boxes of an object that is long in view; over the last stretch it is
+    still right. An object that had to agree with all of its boxes would never be one.
+    """
+    found = None
+    while found is None and len(boxes) >= settings.min_boxes:
+        found = initialise(poses, boxes, K, robust_scale, settings)
+        older = (len(boxes) + 1) // 2
+        poses, boxes = poses[older:], boxes[older:]
+    return found
+
+
 def _first_guess(poses: Array, corners: Array, clip: NDArray[np.bool_], K: Array) -> Array | None:
     """Vector (9,) of an ellipsoid with the axes of the middle view; None if it is behind a camera."""
     whole = ~clip.any(axis=1)

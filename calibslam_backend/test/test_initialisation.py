@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -9,7 +11,7 @@ from scipy.stats import chi2
 from small_world import CAMERA, around, looking_at, objects
 
 from calibslam_backend.box_measurement import BoxMeasurement
-from calibslam_backend.initialisation import InitialisationSettings, Initialised, initialise
+from calibslam_backend.initialisation import InitialisationSettings, Initialised, initialise, initialise_by_newest
 from calibslam_backend.quadric import (
     ALL_EDGES,
     Ellipsoid,
@@ -100,6 +102,26 @@ def test_an_object_behind_the_camera_is_none() -> None:
     # Seen from one side only, its depth is known by the prior on its shape.
     assert start(poses, boxes, InitialisationSettings()) is not None
     assert start(poses[::-1].copy(), boxes, InitialisationSettings()) is None
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_poses_that_drift_contradict_all_boxes_of_an_object_but_not_the_newest(seed: int) -> None:
+    """Motions with errors of 0.3 deg, 40 times: the newest boxes show where the object is from where the camera is."""
+    rng = np.random.default_rng(seed)
+    truth, poses = objects()[4], around(40, turn=3.0)
+    boxes = measured(truth, poses, 2.0, rng)
+    believed = [poses[0]]
+    for before, now in pairwise(poses):
+        error = np.eye(4)
+        error[:3, :3] = Rotation.from_rotvec(rng.normal(0.0, np.radians(0.3), 3)).as_matrix()
+        believed.append(believed[-1] @ np.linalg.inv(before) @ now @ error)
+    drifted, settings = np.stack(believed), InitialisationSettings()
+    assert initialise(drifted, boxes, CAMERA.K, 2.0, settings) is None
+    found = initialise_by_newest(drifted, boxes, CAMERA.K, 2.0, settings)
+    assert found is not None
+    seen = np.linalg.inv(drifted[-1]) @ np.append(found.vector[:3], 1.0)
+    true = np.linalg.inv(poses[-1]) @ np.append(truth.vector()[:3], 1.0)
+    assert np.linalg.norm(seen - true) < 0.15 * np.linalg.norm(true[:3])
 
 
 def test_boxes_of_two_objects_are_refused() -> None:
