@@ -41,7 +41,7 @@ class TrainSettings(Settings):
     batch: int = setting(8, "images per step and process, in stage detector", low=1)
     workers: int = setting(0, "processes that read images", low=0)
     regions: int = setting(512, "detections per step, in stage covariance", low=64)
-    loss: str = setting("f_cal_kl", "of the covariance head", choices=tuple(LOSSES))
+    loss: str = setting("f_cal_cramer", "of the covariance head", choices=tuple(LOSSES))
     boxes: str = setting(BOX_KEYS[0], "which boxes are learnt: of visible parts or of whole objects", choices=BOX_KEYS)
 
 
