@@ -153,6 +153,7 @@ def table(results: dict[str, dict[str, Any]]) -> str:
         "",
         "ATE: how far the trajectory is from the true one. RPE: the same from one keyframe to the next.",
         "NEES: squared position error over stated variance; 3 is honest, more is overconfident.",
+        "One recording hardly tells noise models apart (another: --seed 1); docs/results.md has thirty and more.",
     ]
     return "\n".join(lines)
 
