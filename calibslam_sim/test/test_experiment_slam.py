@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -97,13 +98,37 @@ def test_tum_sees_what_the_folder_holds(folder: Path, recording: Simulation) -> 
     assert all(boxes.has_covariance.all() for boxes in found.images)
 
 
+def test_tum_backwards_undoes_every_motion(folder: Path) -> None:
+    forwards = tum.recorded(tum.TumSettings(folder=str(folder)))
+    found = forwards.backwards()
+    first, last = forwards.images[0].stamp, forwards.images[-1].stamp
+    assert [boxes.stamp for boxes in found.images] == [first + last - boxes.stamp for boxes in forwards.images[::-1]]
+    assert (found.images[0].stamp, found.images[-1].stamp) == (first, last)
+    np.testing.assert_array_equal(found.images[3].corners, forwards.images[-4].corners)
+    assert all(a.end == b.start for a, b in pairwise(found.odometry))
+    whole = np.linalg.multi_dot([motion.T_start_end for motion in found.good + forwards.good])
+    np.testing.assert_allclose(whole, np.eye(4), atol=1e-9)
+    # The truth still says where the camera was when an image was taken.
+    np.testing.assert_array_equal(found.truth.poses[0], forwards.truth.poses[-1])
+    assert found.truth.stamps[0] == first + last - forwards.truth.stamps[-1]
+    again = found.backwards()
+    np.testing.assert_array_equal(again.truth.stamps, forwards.truth.stamps)
+    np.testing.assert_allclose(again.odometry[5].T_start_end, forwards.odometry[5].T_start_end, atol=1e-12)
+
+
 def test_tum_command(folder: Path, tmp_path: Path) -> None:
     arguments = ["tum", "--quick", "--folder", str(folder), "--seeds", "1", "--jobs", "1", "--out", str(tmp_path)]
     assert experiment.main(arguments) == 0
     result = json.loads((tmp_path / "result.json").read_text())
-    assert {"calibrated", "fixed", "quadricslam", "real_given_fixed", "real_estimated_calibrated"} <= set(
-        result["conditions"]
-    )
+    assert {
+        "calibrated",
+        "fixed",
+        "quadricslam",
+        "real_given_fixed",
+        "real_estimated_calibrated",
+        "backwards_estimated_fixed",
+    } <= set(result["conditions"])
+    assert "backwards_given_calibrated_vs_backwards_given_fixed" in result["paired"]
     for metrics in result["conditions"].values():
         assert 0.0 < metrics["ate_m"]["mean"] < 0.5
     assert tum.document(result["settings"])["fixed"]["ate_m"] == (0.429, 0.117)

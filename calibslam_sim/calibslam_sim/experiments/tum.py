@@ -1,10 +1,13 @@
 """`tum`: the document's Tables 5.2 and 5.3 on a folder of the TUM benchmark, and the same with real odometry.
 
-Three families of conditions:
+Families of conditions:
     fixed, quadricslam, calibrated: as in the document, identities given, and each repetition adds its own noise to
         a good trajectory (there ORB-SLAM's) to make odometry of it;
     real_given_...: real visual odometry, identities given;
-    real_estimated_...: real visual odometry and nothing else.
+    real_estimated_...: real visual odometry and nothing else;
+    backwards_given_..., backwards_estimated_...: the same, and the recording played from its end. Its boxes and the
+        errors of its odometry are the same; what is known when, and so which objects begin and who takes which box,
+        is not. What hangs on the order of things shows here.
 Two more, real_given_underconfident and real_given_scale_4, believe calibrated deviations to be 2 and 4 times as large:
 if errors are alike from image to image, what is right for each box is too confident for a row of them.
 With real odometry each repetition leaves out another tenth of the images: their spread tells how far a result hangs
@@ -13,7 +16,7 @@ on single images, not how it would be on other recordings.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from itertools import pairwise
 from pathlib import Path
@@ -57,8 +60,14 @@ NOISE = {
     UNDERCONFIDENT: (OWN_COVARIANCE, 2.0),
     scale_name(4.0): (OWN_COVARIANCE, 4.0),
 }
-REAL_GIVEN, REAL_ESTIMATED = "real_given_", "real_estimated_"
-REAL = {REAL_GIVEN: GIVEN, REAL_ESTIMATED: ESTIMATED}  # prefix of a condition -> association
+REAL_GIVEN, BACKWARDS = "real_given_", "backwards_"
+# Prefix of a condition -> association.
+REAL = {
+    REAL_GIVEN: GIVEN,
+    "real_estimated_": ESTIMATED,
+    BACKWARDS + "given_": GIVEN,
+    BACKWARDS + "estimated_": ESTIMATED,
+}
 GROUND_TRUTH, ODOMETRY, DETECTIONS, CAMERA_INFO = (
     "groundtruth.txt",
     "odometry.txt",
@@ -82,13 +91,31 @@ class TumSettings(ExperimentSettings):
 
 @dataclass(frozen=True)
 class TumRecording:
-    """What a folder holds: the boxes have covariances."""
+    """What a folder holds: the boxes have covariances, the motions have none."""
 
     camera: Camera
     truth: Trajectory
     odometry: list[RelativeMotion]
     good: list[RelativeMotion]
     images: list[Boxes]
+
+    def backwards(self) -> TumRecording:
+        """Played from the end: its last image is the first, at the time that the first one had."""
+        ends = self.images[0].stamp + self.images[-1].stamp
+
+        def undone(motions: list[RelativeMotion]) -> list[RelativeMotion]:
+            return [
+                RelativeMotion(ends - motion.end, ends - motion.start, np.linalg.inv(motion.T_start_end))
+                for motion in reversed(motions)
+            ]
+
+        return TumRecording(
+            self.camera,
+            Trajectory(ends - self.truth.stamps[::-1], self.truth.poses[::-1]),
+            undone(self.odometry),
+            undone(self.good),
+            [replace(boxes, stamp=ends - boxes.stamp) for boxes in reversed(self.images)],
+        )
 
 
 def run(settings: TumSettings, condition: str, seed: Seed) -> Metrics:
@@ -97,6 +124,8 @@ def run(settings: TumSettings, condition: str, seed: Seed) -> Metrics:
     rng = np.random.default_rng(seed)
     family = next((prefix for prefix in REAL if condition.startswith(prefix)), "")
     model, scale = NOISE[condition.removeprefix(family)]
+    if family.startswith(BACKWARDS):
+        recording = recording.backwards()
     motions, images = recording.odometry, recording.images
     if family:
         kept = rng.random(len(images)) >= settings.left_out
