@@ -114,7 +114,7 @@ class ObjectGraph:
         self._K = np.ascontiguousarray(K, float)
         self._settings = settings
         self._prior = priors.prior_covariance()
-        self._drift_sigmas = np.repeat([noise.drift_rotation, noise.drift_translation], 3)
+        self._drift_covariance = noise.drift_covariance()
         self._drifts = False
         self._has_origin = False
         self._motions: list[Motion] = []
@@ -231,7 +231,7 @@ class ObjectGraph:
         self._motions.append(motion)
         if motion.drifts and not self._drifts:
             self._drifts = True
-            noise = gtsam.noiseModel.Diagonal.Sigmas(self._drift_sigmas)
+            noise = gtsam.noiseModel.Gaussian.Covariance(self._drift_covariance)
             self._smoother.insert(_D, np.zeros(DRIFT))
             self._smoother.add("drift", gtsam.PriorFactorVector(_D, np.zeros(DRIFT), noise))
         self._smoother.insert(_x(k), gtsam.Pose3(guess))

@@ -41,6 +41,7 @@ def run(world: SmallWorld, drift: Array, sigmas: Array) -> Estimator:
         translation_floor=np.sqrt(STEPS) * world.translation_sigma,
         drift_rotation=float(sigmas[0]),
         drift_translation=float(sigmas[3]),
+        scene_depth=0.0,
     )
     estimator = Estimator(CAMERA, np.eye(4), settings)
     motions = drifting(world, drift)

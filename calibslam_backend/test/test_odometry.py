@@ -209,7 +209,7 @@ def moved(k: int, x: float, covariance: Array | None = None) -> RelativeMotion:
 
 def test_an_impossible_step_is_replaced_by_going_on_as_before() -> None:
     """0.1, 1.5, 0.1 m in 0.1 s each: from 1 to 15 m/s in a step, where 3 g allow 3 m/s."""
-    chain = MotionChain(MotionNoise(translation_floor=0.01, translation_share=0.0), np.eye(4))
+    chain = MotionChain(MotionNoise(translation_floor=0.01, translation_share=0.0, scene_depth=0.0), np.eye(4))
     said = [chain.add(moved(k, x)) for k, x in enumerate((0.1, 1.5, 0.1))]
     assert said == ["", "odometry_implausible", ""]
     T, covariance = chain.between(T0, T0 + 3 * STEP)
@@ -243,12 +243,38 @@ def test_after_a_gap_any_velocity_is_possible() -> None:
 
 def test_unknown_covariances_by_hand() -> None:
     """sqrt(floor^2 + (share * motion)^2): a turn of 0.5 rad and no translation, then the reverse."""
-    noise = MotionNoise(rotation_floor=0.03, rotation_share=0.08, translation_floor=0.01, translation_share=0.1)
+    noise = MotionNoise(
+        rotation_floor=0.03, rotation_share=0.08, translation_floor=0.01, translation_share=0.1, scene_depth=0.0
+    )
     turn = noise.covariance(exp(np.array([0.0, 0.5, 0.0, 0.0, 0.0, 0.0])).matrix())
     np.testing.assert_allclose(np.sqrt(np.diag(turn)), [0.05] * 3 + [0.01] * 3)
     move = noise.covariance(exp(np.array([0.0, 0.0, 0.0, 0.0, 0.24, 0.0])).matrix())
     np.testing.assert_allclose(np.sqrt(np.diag(move)), [0.03] * 3 + [0.026] * 3)
     assert np.count_nonzero(turn) == 6
+
+
+@pytest.mark.parametrize("rate", [False, True])
+def test_errors_of_visual_odometry_turn_the_camera_about_the_scene(rate: bool) -> None:
+    """Drawn: a point 2 m ahead is displaced by the deviation of the translation, whatever that of the rotation."""
+    noise = MotionNoise(
+        rotation_floor=0.03,
+        rotation_share=0.0,
+        translation_floor=0.004,
+        translation_share=0.0,
+        drift_rotation=0.03,
+        drift_translation=0.004,
+        scene_depth=2.0,
+    )
+    covariance = noise.drift_covariance() if rate else noise.covariance(np.eye(4))
+    errors = np.random.default_rng(0).multivariate_normal(np.zeros(6), covariance, size=20_000)
+    scene = np.array([0.0, 0.0, 2.0])
+    displaced = errors[:, 3:] + np.cross(errors[:, :3], scene)
+    np.testing.assert_allclose(displaced.std(axis=0), 0.004, rtol=0.03)
+    np.testing.assert_allclose(errors[:, :3].std(axis=0), 0.03, rtol=0.03)
+    # By hand: a camera that errs by 0.03 rad about its y axis moves by 2 m * 0.03 rad against x.
+    assert covariance[1, 3] == pytest.approx(-2.0 * 0.03**2)
+    assert covariance[0, 4] == pytest.approx(2.0 * 0.03**2)
+    np.testing.assert_allclose(np.diag(covariance)[3:], [0.004**2 + 0.06**2, 0.004**2 + 0.06**2, 0.004**2])
 
 
 def test_one_unknown_step_makes_the_whole_motion_unknown() -> None:
