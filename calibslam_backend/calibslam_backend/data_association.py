@@ -246,15 +246,15 @@ class DataAssociation:
             first = initialise_by_newest(poses, boxes, self.camera.K, self.settings.robust_scale, self.settings)
             if first is None:
                 continue
-            known = self._same_as(first.vector, candidate)
+            known = self._same_as(first.vector, candidate, rows)
             self._bind(track, self._assignments.begin(first.vector) if known is None else known)
 
     def start_leftovers(self) -> None:
         """`start_quadrics` for every open track: with better poses, some determine a quadric that did not before."""
         self.start_quadrics([t for t, candidate in self._assignments.tracks.items() if candidate.quadric is None])
 
-    def _same_as(self, vector: Array, candidate: Candidate) -> int | None:
-        """The quadric that this one is, if the map has it."""
+    def _same_as(self, vector: Array, candidate: Candidate, rows: list[tuple[int, int]]) -> int | None:
+        """The quadric that this one, of these boxes (keyframe, row) of a track, is, if the map has it."""
         if self.settings.association == GIVEN:
             return None
         ids, vectors = self._graph.quadrics()
@@ -264,7 +264,12 @@ class DataAssociation:
         for n in np.argsort(np.linalg.norm(vectors[:, :3] - vector[:3], axis=1)):
             j = ids[n]
             classes = self._assignments.classes[j]
-            if same[n] and classes.keys() & candidate.classes.keys() and not self._assignments.seen_apart(candidate, j):
+            if (
+                same[n]
+                and classes.keys() & candidate.classes.keys()
+                and not self._assignments.seen_apart(candidate, j)
+                and self._assignments.explains(j, rows, self.camera.K)
+            ):
                 return j
         return None
 

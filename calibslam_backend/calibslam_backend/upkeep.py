@@ -100,8 +100,8 @@ class Upkeep:
         if not ids:
             return
         pairs = vectors[:, None], vectors[None]
-        # An older quadric of its place, size and class, never seen beside it, is the same object; even one seen beside
-        # it, if both have settled at one place.
+        # An older quadric of its place, size and class, never seen beside it, that explains its boxes, is the same
+        # object; even one seen beside it, if both have settled at one place.
         settled = np.array([self._assignments.age(j) >= self._assignments.YOUNG for j in ids])
         inside = at_one_place(*pairs) & settled[:, None]
         gone = set()
@@ -109,7 +109,10 @@ class Upkeep:
             j, older = ids[m], ids[n]
             if j in gone or len({self._assignments.class_of_quadric(i) for i in (j, older)}) > 1:
                 continue
-            if inside[m, n] or not self._assignments.seen_beside(j, older):
+            if inside[m, n] or (
+                not self._assignments.seen_beside(j, older)
+                and self._assignments.explains(older, self._assignments.rows(j), self._camera.K)
+            ):
                 self._unite(j, older)
                 gone.add(j)
 

@@ -1,4 +1,4 @@
-"""What association got wrong and upkeep mends: cups before a camera that moves sideways, books kept by hand."""
+"""Which quadrics there are: begun, united, dropped; cups before a camera that moves sideways, books kept by hand."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import pytest
 from calibslam_backend.assignments import Assignments, Frame
 from calibslam_backend.association import GIVEN
 from calibslam_backend.box_measurement import prepare
+from calibslam_backend.data_association import DataAssociation
 from calibslam_backend.estimator_settings import EstimatorSettings
 from calibslam_backend.graph import Motion, ObjectGraph
 from calibslam_backend.kernels import load_kernels
@@ -19,6 +20,9 @@ from calibslam_msgs_py.measurements import Array, Boxes, Camera
 
 CAMERA = Camera(640, 480, np.array([[500.0, 0.0, 320.0], [0.0, 500.0, 240.0], [0.0, 0.0, 1.0]]), np.zeros(5))
 LEFT, RIGHT = (-0.3, 0.0, 2.0), (0.3, 0.0, 2.0)  # [m] in the first camera
+# Nearer to the left one than 0.7 of their radii's sum. Its box of 30 px is 12 px away (overlap 0.4), 20 px (0.2), and
+# behind it hardly smaller.
+NEIGHBOURS = {(-0.25, 0.0, 2.0): True, (-0.22, 0.0, 2.0): False, (-0.31, 0.0, 2.07): True}
 FRAMES = 12
 
 
@@ -32,6 +36,7 @@ class World:
         self.books = Assignments(self.graph)
         self.counts: Counter[str] = Counter()
         self.upkeep = Upkeep(self.books, CAMERA, s, self.counts)
+        self.objects = DataAssociation(self.books, CAMERA, s, self.counts)
         self.graph.add_origin()
         step = np.eye(4)
         step[0, 3] = 0.05
@@ -138,6 +143,29 @@ def test_relocalisation_does_not_unite_what_was_seen_side_by_side(together: bool
     assert len(world.graph.landmarks) == (2 if together else 1)
     assert world.counts["merged"] == (0 if together else 1)
     assert world.books.same == []
+
+
+@pytest.mark.parametrize(("place", "one"), NEIGHBOURS.items())
+def test_what_is_near_is_one_if_it_explains_the_boxes(place: tuple[float, float, float], one: bool) -> None:
+    """Seen one after the other: whether the second is begun, or united with the first once it is there."""
+    world = World()
+    first = world.books.begin(world.cup(LEFT))
+    for k in range(FRAMES):
+        world.show((LEFT, 0) if k < 2 else (place, 1))
+    world.books.bind(0, first)
+    world.objects.start_quadrics([1])
+    assert sorted(world.graph.landmarks) == ([first] if one else [first, first + 1])
+    if not one:
+        world.upkeep.merge()
+        assert world.books.tracks[1].quadric == first + 1
+        return
+    second = world.books.begin(world.cup(place))
+    for k in world.keyframes(first)[2:]:
+        world.books.take(k, 0)
+    world.books.bind(1, second)
+    world.upkeep.merge()
+    assert list(world.graph.landmarks) == [first]
+    assert world.keyframes(first) == list(range(FRAMES))
 
 
 def test_three_that_are_one_become_the_oldest() -> None:
