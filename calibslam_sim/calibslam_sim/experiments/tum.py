@@ -105,7 +105,7 @@ class TumRecording:
 
         def undone(motions: list[RelativeMotion]) -> list[RelativeMotion]:
             return [
-                RelativeMotion(ends - motion.end, ends - motion.start, np.linalg.inv(motion.T_start_end))
+                RelativeMotion(ends - motion.end, ends - motion.start, np.linalg.inv(motion.T_start_end).astype(float))
                 for motion in reversed(motions)
             ]
 
