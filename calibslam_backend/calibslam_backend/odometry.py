@@ -33,9 +33,9 @@ class MotionNoise(Settings):
     `scene_depth` in front of the camera on its optical axis."""
 
     rotation_floor: float = setting(0.003, "unknown odometry noise: rotation at rest", unit="rad", low=1e-6)
-    rotation_share: float = setting(0.07, "unknown odometry noise: share of the rotation", low=0.0, high=1.0)
+    rotation_share: float = setting(0.05, "unknown odometry noise: share of the rotation", low=0.0, high=1.0)
     translation_floor: float = setting(0.003, "unknown odometry noise: translation at rest", unit="m", low=1e-6)
-    translation_share: float = setting(0.04, "unknown odometry noise: share of the translation", low=0.0, high=1.0)
+    translation_share: float = setting(0.02, "unknown odometry noise: share of the translation", low=0.0, high=1.0)
     scene_depth: float = setting(
         1.0, "unknown odometry noise: how far away is what it sees; 0 if it is not visual", unit="m", low=0.0
     )
