@@ -82,8 +82,8 @@ class Assignments:
     """
 
     # Keyframes after which a quadric has settled; before, it may turn out to be one that was known already.
-    LEAST_OVERLAP = 1.0 / 3.0  # median, of boxes and those of a quadric that explains them
     YOUNG = 30
+    LEAST_OVERLAP = 1.0 / 3.0  # median, of boxes and those of a quadric that explains them
 
     def __init__(self, graph: ObjectGraph) -> None:
         self.graph = graph
