@@ -13,7 +13,6 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from calibslam_backend.association import median_overlap
 from calibslam_backend.box_measurement import BoxMeasurement, stacked
 from calibslam_backend.graph import ObjectGraph
 from calibslam_backend.revision import Evidence
@@ -83,7 +82,6 @@ class Assignments:
 
     # Keyframes after which a quadric has settled; before, it may turn out to be one that was known already.
     YOUNG = 30
-    LEAST_OVERLAP = 1.0 / 3.0  # median, of boxes and those of a quadric that explains them
 
     def __init__(self, graph: ObjectGraph) -> None:
         self.graph = graph
@@ -146,18 +144,6 @@ class Assignments:
         """Whether images show both quadrics, as two boxes."""
         return _apart(*(self.graph.landmarks[i].boxes.keys() for i in (j, other)))
 
-    def explains(self, j: int, rows: list[tuple[int, int]], K: Array) -> bool:
-        """Whether a quadric explains boxes, (keyframe, row), that are thought to be of another one near it.
-
-        Neighbours of a row of chairs are near each other and alike, too; but seen from where the boxes were, one of
-        them is not where the other is.
-        """
-        if not rows:
-            return True
-        poses = np.stack([self.graph.pose(k) for k, _ in rows])
-        boxes = [self.frames[k].boxes[n] for k, n in rows]
-        return median_overlap(poses, boxes, self.graph.quadric(j), K) >= self.LEAST_OVERLAP
-
     # -- boxes --------------------------------------------------------------------------------------------------
 
     def give(self, k: int, n: int, j: int) -> bool:
@@ -182,10 +168,6 @@ class Assignments:
     def row(self, k: int, j: int) -> int:
         """Of the box of quadric j in keyframe k."""
         return self.frames[k].quadrics.index(j)
-
-    def rows(self, j: int) -> list[tuple[int, int]]:
-        """The boxes of quadric j, (keyframe, row)."""
-        return [(k, self.row(k, j)) for k in self.graph.landmarks[j].boxes]
 
     # -- bindings -----------------------------------------------------------------------------------------------
 

@@ -26,6 +26,7 @@ from calibslam_msgs_py.settings import Settings, setting
 
 GIVEN, ESTIMATED = "given", "estimated"
 SIZE_RATIO = 3.0  # mean radii of one object, estimated twice, differ by less than this factor
+LEAST_OVERLAP = 1.0 / 3.0  # median, of boxes and those of a quadric that explains them
 ONE_PLACE = 0.5  # distance of two centres, in mean radii of the smaller, within which there is room for one object only
 
 
@@ -202,6 +203,15 @@ def same_object(a: Array, b: Array, merge_distance: float) -> NDArray[np.bool_]:
     size, other = mean_radius(a), mean_radius(b)
     alike = np.maximum(size, other) < SIZE_RATIO * np.minimum(size, other)
     return np.asarray(alike & (distances < merge_distance * (size + other)))
+
+
+def explains(quadric: Array, poses: Array, boxes: Sequence[BoxMeasurement], K: Array) -> bool:
+    """Whether a quadric explains N boxes that are thought to be of another one near it; arguments as `median_overlap`.
+
+    Neighbours of a row of chairs are near each other and alike, too; but seen from where the boxes were, one of them is
+    not where the other is. Without boxes nothing speaks against it.
+    """
+    return not boxes or median_overlap(poses, boxes, quadric, K) >= LEAST_OVERLAP
 
 
 def at_one_place(a: Array, b: Array) -> NDArray[np.bool_]:

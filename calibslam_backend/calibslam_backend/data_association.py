@@ -20,6 +20,7 @@ from calibslam_backend.association import (
     Votes,
     assign,
     distances,
+    explains,
     predict,
     predicted_corners,
     same_object,
@@ -246,15 +247,15 @@ class DataAssociation:
             first = initialise_by_newest(poses, boxes, self.camera.K, self.settings.robust_scale, self.settings)
             if first is None:
                 continue
-            known = self._same_as(first.vector, candidate, rows)
+            known = self._same_as(first.vector, candidate, poses, boxes)
             self._bind(track, self._assignments.begin(first.vector) if known is None else known)
 
     def start_leftovers(self) -> None:
         """`start_quadrics` for every open track: with better poses, some determine a quadric that did not before."""
         self.start_quadrics([t for t, candidate in self._assignments.tracks.items() if candidate.quadric is None])
 
-    def _same_as(self, vector: Array, candidate: Candidate, rows: list[tuple[int, int]]) -> int | None:
-        """The quadric that this one, of these boxes (keyframe, row) of a track, is, if the map has it."""
+    def _same_as(self, vector: Array, candidate: Candidate, poses: Array, boxes: list[BoxMeasurement]) -> int | None:
+        """The quadric that this one, of a track's boxes seen from these poses, is, if the map has it."""
         if self.settings.association == GIVEN:
             return None
         ids, vectors = self._graph.quadrics()
@@ -268,7 +269,7 @@ class DataAssociation:
                 same[n]
                 and classes.keys() & candidate.classes.keys()
                 and not self._assignments.seen_apart(candidate, j)
-                and self._assignments.explains(j, rows, self.camera.K)
+                and explains(vectors[n], poses, boxes, self.camera.K)
             ):
                 return j
         return None

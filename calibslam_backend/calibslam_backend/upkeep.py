@@ -7,10 +7,10 @@ from collections import Counter
 import numpy as np
 
 from calibslam_backend.assignments import Assignments
-from calibslam_backend.association import GIVEN, at_one_place, same_object
+from calibslam_backend.association import GIVEN, at_one_place, explains, same_object
 from calibslam_backend.estimator_settings import EstimatorSettings
 from calibslam_backend.revision import Revision
-from calibslam_msgs_py.measurements import Camera
+from calibslam_msgs_py.measurements import Array, Camera
 
 
 class Upkeep:
@@ -109,12 +109,15 @@ class Upkeep:
             j, older = ids[m], ids[n]
             if j in gone or len({self._assignments.class_of_quadric(i) for i in (j, older)}) > 1:
                 continue
-            if inside[m, n] or (
-                not self._assignments.seen_beside(j, older)
-                and self._assignments.explains(older, self._assignments.rows(j), self._camera.K)
-            ):
+            if inside[m, n] or (not self._assignments.seen_beside(j, older) and self._explains(vectors[n], j)):
                 self._unite(j, older)
                 gone.add(j)
+
+    def _explains(self, vector: Array, j: int) -> bool:
+        """Whether a quadric (9,) explains the boxes of quadric j."""
+        boxes = self._graph.landmarks[j].boxes
+        poses = np.reshape([self._graph.pose(k) for k in boxes], (-1, 4, 4))
+        return explains(vector, poses, list(boxes.values()), self._camera.K)
 
     def _unite(self, j: int, target: int) -> None:
         self._assignments.unite(j, target)

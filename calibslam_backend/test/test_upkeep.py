@@ -146,8 +146,8 @@ def test_relocalisation_does_not_unite_what_was_seen_side_by_side(together: bool
 
 
 @pytest.mark.parametrize(("place", "one"), NEIGHBOURS.items())
-def test_what_is_near_is_one_if_it_explains_the_boxes(place: tuple[float, float, float], one: bool) -> None:
-    """Seen one after the other: whether the second is begun, or united with the first once it is there."""
+def test_what_is_near_is_no_new_object_if_it_explains_the_boxes(place: tuple[float, float, float], one: bool) -> None:
+    """Seen one after the other."""
     world = World()
     first = world.books.begin(world.cup(LEFT))
     for k in range(FRAMES):
@@ -155,17 +155,23 @@ def test_what_is_near_is_one_if_it_explains_the_boxes(place: tuple[float, float,
     world.books.bind(0, first)
     world.objects.start_quadrics([1])
     assert sorted(world.graph.landmarks) == ([first] if one else [first, first + 1])
-    if not one:
-        world.upkeep.merge()
-        assert world.books.tracks[1].quadric == first + 1
-        return
-    second = world.books.begin(world.cup(place))
-    for k in world.keyframes(first)[2:]:
-        world.books.take(k, 0)
-    world.books.bind(1, second)
     world.upkeep.merge()
-    assert list(world.graph.landmarks) == [first]
-    assert world.keyframes(first) == list(range(FRAMES))
+    assert world.books.tracks[1].quadric == (first if one else first + 1)
+
+
+@pytest.mark.parametrize(("place", "one"), NEIGHBOURS.items())
+def test_what_is_near_is_united_if_it_explains_the_boxes(place: tuple[float, float, float], one: bool) -> None:
+    """Both were begun, and seen one after the other."""
+    world = World()
+    ids = [world.books.begin(world.cup(cup)) for cup in (LEFT, place)]
+    for k in range(FRAMES):
+        world.show((LEFT, 0) if k < 2 else (place, 1))
+    for track, j in enumerate(ids):
+        world.books.bind(track, j)
+    world.upkeep.merge()
+    assert sorted(world.graph.landmarks) == (ids[:1] if one else ids)
+    assert world.keyframes(ids[0]) == list(range(FRAMES if one else 2))
+    assert world.books.tracks[1].quadric == ids[0 if one else 1]
 
 
 def test_three_that_are_one_become_the_oldest() -> None:
