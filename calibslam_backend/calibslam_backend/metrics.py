@@ -13,7 +13,7 @@ from evo.core.geometry import GeometryException
 from evo.core.trajectory import PoseTrajectory3D
 from scipy.spatial.transform import Rotation, Slerp
 
-from calibslam_msgs_py.measurements import Array
+from calibslam_msgs_py.measurements import Array, StampedPose
 
 MAX_STAMP_DIFFERENCE = 0.02  # [s] between a keyframe and its ground truth
 
@@ -24,6 +24,11 @@ class Trajectory:
 
     stamps: Array
     poses: Array
+
+    @classmethod
+    def of(cls, poses: Sequence[StampedPose]) -> Trajectory:
+        """Of at least one pose, in the order of time."""
+        return cls(np.array([pose.stamp for pose in poses]), np.stack([pose.T for pose in poses]))
 
     def evo(self) -> PoseTrajectory3D:
         """The same for evo."""

@@ -5,8 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
-
 from calibslam_backend.metrics import Trajectory
 from calibslam_backend.odometry import OdometryDifferencer
 from calibslam_backend.quadric import Ellipsoid
@@ -52,7 +50,7 @@ def read_reference(path: Path) -> Reference:
 
 def _from_tum(path: Path) -> Reference:
     if path.is_file():
-        return Reference(_trajectory(read_trajectory(path)), [], None)
+        return Reference(Trajectory.of(read_trajectory(path)), [], None)
     motions: list[RelativeMotion] = []
     if (path / "odometry.txt").exists():
         differencer = OdometryDifferencer()
@@ -60,7 +58,7 @@ def _from_tum(path: Path) -> Reference:
             motion = differencer.add(pose.stamp, pose.T)
             if motion is not None:
                 motions.append(motion)
-    return Reference(_trajectory(read_trajectory(path / "groundtruth.txt")), motions, None)
+    return Reference(Trajectory.of(read_trajectory(path / "groundtruth.txt")), motions, None)
 
 
 def _from_bag(path: Path) -> Reference:
@@ -89,8 +87,4 @@ def _from_bag(path: Path) -> Reference:
                 continue  # the back end has counted and reported it
     if len(poses) < 2:
         raise NoReference(f"{path}: {topics.GROUND_TRUTH} holds {len(poses)} usable poses")
-    return Reference(_trajectory([poses[stamp] for stamp in sorted(poses)]), motions, objects)
-
-
-def _trajectory(poses: list[StampedPose]) -> Trajectory:
-    return Trajectory(np.array([pose.stamp for pose in poses]), np.stack([pose.T for pose in poses]))
+    return Reference(Trajectory.of([poses[stamp] for stamp in sorted(poses)]), motions, objects)

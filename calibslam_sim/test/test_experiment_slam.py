@@ -100,7 +100,7 @@ def test_tum_sees_what_the_folder_holds(folder: Path, recording: Simulation) -> 
 
 def test_tum_backwards_undoes_every_motion(folder: Path) -> None:
     forwards = tum.recorded(tum.TumSettings(folder=str(folder)))
-    found = forwards.backwards()
+    found = forwards.backwards
     first, last = forwards.images[0].stamp, forwards.images[-1].stamp
     assert [boxes.stamp for boxes in found.images] == [first + last - boxes.stamp for boxes in forwards.images[::-1]]
     assert (found.images[0].stamp, found.images[-1].stamp) == (first, last)
@@ -111,7 +111,7 @@ def test_tum_backwards_undoes_every_motion(folder: Path) -> None:
     # The truth still says where the camera was when an image was taken.
     np.testing.assert_array_equal(found.truth.poses[0], forwards.truth.poses[-1])
     assert found.truth.stamps[0] == first + last - forwards.truth.stamps[-1]
-    again = found.backwards()
+    again = found.backwards
     np.testing.assert_array_equal(again.truth.stamps, forwards.truth.stamps)
     np.testing.assert_allclose(again.odometry[5].T_start_end, forwards.odometry[5].T_start_end, atol=1e-12)
 

@@ -23,7 +23,7 @@ from scipy.stats import multivariate_t
 
 from calibslam_backend.metrics import Trajectory, interpolated
 from calibslam_backend.odometry import MotionNoise
-from calibslam_msgs_py.measurements import SECOND, Array, StampedPose
+from calibslam_msgs_py.measurements import SECOND, Array
 from calibslam_sim.tum_folder import read_trajectory
 
 TAIL = 4  # degrees of freedom
@@ -38,7 +38,7 @@ class Motions:
     """Motions (N, 4, 4) of a recording by odometry, their errors (N, 6) [rad, m] and durations (N,) [s]."""
 
     def __init__(self, folder: Path, images: int) -> None:
-        truth, odometry = (_trajectory(read_trajectory(folder / f"{x}.txt")) for x in ("groundtruth", "odometry"))
+        truth, odometry = (Trajectory.of(read_trajectory(folder / f"{x}.txt")) for x in ("groundtruth", "odometry"))
         covered, true = interpolated(truth, odometry.stamps[::images])
         stamps, measured = odometry.stamps[::images][covered], odometry.poses[::images][covered]
         self.motions = np.stack([np.linalg.inv(a) @ b for a, b in pairwise(measured)])
@@ -58,10 +58,6 @@ class Motions:
             multivariate_t.logpdf(error, shape=noise.covariance(motion), df=TAIL)
             for error, motion in zip(beside, self.motions, strict=True)
         )
-
-
-def _trajectory(poses: Sequence[StampedPose]) -> Trajectory:
-    return Trajectory(np.array([pose.stamp for pose in poses]), np.stack([pose.T for pose in poses]))
 
 
 def fit(recordings: Sequence[Motions], **fixed: float) -> tuple[float, dict[str, float]]:

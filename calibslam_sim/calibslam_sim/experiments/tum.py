@@ -17,7 +17,7 @@ on single images, not how it would be on other recordings.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -99,6 +99,7 @@ class TumRecording:
     good: list[RelativeMotion]
     images: list[Boxes]
 
+    @cached_property
     def backwards(self) -> TumRecording:
         """Played from the end: its last image is the first, at the time that the first one had."""
         ends = self.images[0].stamp + self.images[-1].stamp
@@ -125,7 +126,7 @@ def run(settings: TumSettings, condition: str, seed: Seed) -> Metrics:
     family = next((prefix for prefix in REAL if condition.startswith(prefix)), "")
     model, scale = NOISE[condition.removeprefix(family)]
     if family.startswith(BACKWARDS):
-        recording = recording.backwards()
+        recording = recording.backwards
     motions, images = recording.odometry, recording.images
     if family:
         kept = rng.random(len(images)) >= settings.left_out
@@ -161,7 +162,7 @@ def recorded(settings: TumSettings) -> TumRecording:
         images = read_detections(folder / DETECTIONS, camera)[: settings.most_images]
         return TumRecording(
             camera,
-            Trajectory(np.array([pose.stamp for pose in truth]), np.stack([pose.T for pose in truth])),
+            Trajectory.of(truth),
             steps(read_trajectory(folder / ODOMETRY)),
             steps(read_trajectory(folder / settings.good_trajectory)),
             [calibrate(boxes) for boxes in images],
