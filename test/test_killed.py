@@ -15,7 +15,7 @@ import numpy as np
 from calibslam_msgs.msg import BoundingBoxArray, RelativePose
 from calibslam_msgs.srv import LoadMap
 from geometry_msgs.msg import PoseWithCovarianceStamped
-from live import Process, Watcher, random_domain, trajectory_of, wait_until
+from live import Process, Watcher, asking_for_kept, random_domain, trajectory_of, wait_until
 from nav_msgs.msg import Path as PathMessage
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import CameraInfo
@@ -39,11 +39,6 @@ TYPES = RosTypes()
 PACE = 0.015  # [s] between messages
 # All of it is kept for a back end that was away.
 KEPT = QoSProfile(depth=1000, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-ASK_FOR_KEPT = [
-    part
-    for topic in ("/detections", "/relative_pose")
-    for part in ("-p", f"qos_overrides.{topic}.subscription.durability:=transient_local")
-]
 
 
 class Robot:
@@ -77,8 +72,8 @@ class Robot:
 
 def backend(domain: int, journal: Path, *options: str) -> Process:
     # A refinement after a rest would come at other moments than without interruption.
-    settings = ("-p", f"journal:={journal}", "-p", "refine_after:=1000.0", *ASK_FOR_KEPT, *options)
-    return Process(domain, "calibslam_backend", "backend", "--ros-args", *settings)
+    settings = ("-p", f"journal:={journal}", "-p", "refine_after:=1000.0", *options)
+    return Process(domain, "calibslam_backend", "backend", *asking_for_kept("/detections", "/relative_pose"), *settings)
 
 
 def undisturbed() -> Estimator:

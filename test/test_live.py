@@ -14,7 +14,7 @@ import pytest
 from calibslam_msgs.msg import QuadricArray
 from calibslam_msgs.srv import LoadMap, SaveMap
 from geometry_msgs.msg import PoseWithCovarianceStamped
-from live import Process, Watcher, keeping_all, random_domain, trajectory_of, wait_until
+from live import Process, Watcher, asking_for_kept, keeping_all, random_domain, trajectory_of, wait_until
 from nav_msgs.msg import Path as PathMessage
 from visualization_msgs.msg import MarkerArray
 
@@ -74,7 +74,7 @@ def live(bag: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Live]:
     with BagReader(bag) as reader:
         images, motions = reader.counts["/detections"], reader.counts["/odom"] - 1
     backends = [
-        ["--ros-args", "-r", f"__ns:={namespace or '/'}", "-p", f"noise_model:={model}",
+        [*asking_for_kept("/relative_pose"), "-r", f"__ns:={namespace or '/'}", "-p", f"noise_model:={model}",
          "-p", f"map_folder:={tmp_path_factory.getbasetemp()}",
          *(part for topic in INPUTS for part in ("-r", f"{topic}:=/{topic}"))]
         for namespace, model in NAMESPACES.items()

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from live import Process, Watcher, keeping_all, random_domain, trajectory_of, wait_until
+from live import Process, Watcher, asking_for_kept, keeping_all, random_domain, trajectory_of, wait_until
 from nav_msgs.msg import Path as PathMessage
 
 from calibslam_backend import slam_bag
@@ -104,7 +104,7 @@ def test_live_equals_offline(
         Watcher(domain) as watcher,
         Process(domain, "calibslam_sim", "odometry", *keeping_all("/relative_pose")) as odometry,
         Process(domain, "calibslam_detector", "calibrator", *keeping_all("/detections")) as calibrator,
-        Process(domain, "calibslam_backend", "backend") as backend,
+        Process(domain, "calibslam_backend", "backend", *asking_for_kept("/detections", "/relative_pose")) as backend,
     ):
         watcher.listen(PathMessage, "/trajectory")
         options = [str(bag), "--rate", str(RATE), *waiting, "--wait-timeout", "120"]

@@ -49,6 +49,8 @@ class Condition:
     title: str
 
 
+# To get the first motions also where `odometry` finds a back end late.
+ASK_FOR_KEPT = ("-p", "qos_overrides./relative_pose.subscription.durability:=transient_local")
 CONDITIONS = (
     Condition("fixed", "fixed", topics.DETECTIONS, "SLAM, every edge 5 px"),
     Condition("calibrated", "calibrated", topics.DETECTIONS, "SLAM, each box's own covariance"),
@@ -73,10 +75,11 @@ def run_live(bag: Path, out: Path, rate: float) -> None:
             inputs = ["-r", f"detections:={condition.detections}"]
             for topic in ("relative_pose", "camera/camera_info"):
                 inputs += ["-r", f"{topic}:=/{topic}"]
+            settings = [*ASK_FOR_KEPT, "-p", f"noise_model:={condition.noise_model}", "-p", f"map_folder:={out}"]
             processes.start(
                 condition.name,
                 "calibslam_backend.backend_node",
-                [*namespace, *inputs, "-p", f"noise_model:={condition.noise_model}", "-p", f"map_folder:={out}"],
+                [*namespace, *inputs, *settings],
             )
             processes.start(
                 f"{condition.name}_recorder",

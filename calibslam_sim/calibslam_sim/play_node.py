@@ -79,7 +79,8 @@ class Player(Node):
                 raise PlayError(f"after {timeout:g} s: {', '.join(texts)}")
             time.sleep(SUBSCRIBER_POLL)
         if not expected.keys() <= self._publishers_by_topic.keys():
-            # That a subscriber exists does not tell whether another node's publisher has found it yet.
+            # That a subscriber exists does not tell whether another node's publisher has found it yet, which took up to
+            # 2 s on a busy machine. A subscriber that asks for kept messages (transient local) loses nothing even then.
             time.sleep(SECONDS_TO_CONNECT)
 
     def _subscribers(self, topic: str) -> int:

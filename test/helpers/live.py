@@ -55,6 +55,18 @@ def keeping_all(topic: str) -> list[str]:
     return ["--ros-args", "-p", f"qos_overrides.{topic}.publisher.depth:=5000"]
 
 
+def asking_for_kept(*topics: str) -> list[str]:
+    """Arguments for a node that subscribes to these: it also gets what was published before it was connected.
+
+    A publisher of another process may find a new subscriber only seconds after everybody sees it in the graph, and
+    what it publishes until then would be lost.
+    """
+    return [
+        "--ros-args",
+        *(part for t in topics for part in ("-p", f"qos_overrides.{t}.subscription.durability:=transient_local")),
+    ]
+
+
 class Process:
     """An installed executable in a DDS domain; a context manager that does not let it outlive the test."""
 
