@@ -130,3 +130,21 @@ def box_tangents(
         for (pose, quadric), row in zip(keys, rows, strict=True)
     ]
     return factors, rows[:, 16]
+
+
+def pose_information(
+    T_map_camera: Array, quadrics: Sequence[Array], boxes: Sequence[BoxMeasurement], K: Array
+) -> Array:
+    """Fisher information (6, 6) of N boxes on a pose [rotation, translation in the camera], their quadrics being known.
+
+    Args:
+        T_map_camera: (4, 4).
+        quadrics: N vectors (9,).
+        boxes: N, one of each quadric.
+        K: (3, 3) camera matrix [px].
+    """
+    if not boxes:
+        return np.zeros((6, 6))
+    poses, packed = np.tile(T_map_camera, (len(boxes), 1, 1)), np.stack([box.packed for box in boxes])
+    rows = _tangents(poses, np.stack(quadrics), K, packed, np.inf, 1.0)[:, POSE]
+    return np.asarray(np.einsum("nai,nbi->ab", rows, rows))

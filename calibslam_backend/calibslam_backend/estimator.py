@@ -201,7 +201,7 @@ class Estimator:
 
     def pose_covariance(self, index: int) -> Array:
         """(6, 6) [rotation, translation] of a keyframe in its camera frame."""
-        return self._graph.pose_covariance(index)
+        return self._graph.correlation.understated * self._graph.pose_covariance(index)
 
     def object_map(self) -> ObjectMap:
         """Everything that is estimated, with covariances."""
@@ -218,6 +218,7 @@ class Estimator:
     def quadrics(self) -> list[QuadricEstimate]:
         """The map."""
         result = []
+        understated = self._graph.correlation.understated
         for j, covariance in self._graph.quadric_covariances().items():
             vector = self._graph.quadric(j)
             ellipsoid = Ellipsoid.from_vector(vector)
@@ -227,7 +228,7 @@ class Estimator:
                     self._assignments.class_of_quadric(j),
                     ellipsoid.T_world_object,
                     ellipsoid.radii,
-                    covariance_of_pose_and_radii(vector, covariance),
+                    covariance_of_pose_and_radii(vector, understated * covariance),
                     len(self._graph.landmarks[j].boxes),
                 )
             )

@@ -18,8 +18,8 @@ import gtsam
 import numpy as np
 from gtsam import symbol
 
-from calibslam_backend.box_correlation import BoxCorrelation
-from calibslam_backend.box_factor import box_factor, box_tangents
+from calibslam_backend.box_correlation import LAGS, BoxCorrelation
+from calibslam_backend.box_factor import box_factor, box_tangents, pose_information
 from calibslam_backend.box_measurement import BoxMeasurement
 from calibslam_backend.initialisation import InitialisationSettings
 from calibslam_backend.odometry import MotionNoise, dead_reckoning
@@ -240,6 +240,8 @@ class ObjectGraph:
             _x(k - 1), _x(k), _D, motion.T, motion.covariance, motion.drifts, self._settings.robust_odometry
         )
         self._smoother.add(("motion", k), factor)
+        if k > self.NEW_POSES:
+            self._learn_motion(k - self.NEW_POSES)
         return k
 
     def add_quadric(self, j: int, vector: Array) -> None:
@@ -340,13 +342,22 @@ class ObjectGraph:
         return dict(zip(boxes, tangents, strict=True))
 
     def _learn_correlation(self, boxes: list[tuple[str, int, int]], residuals: Array) -> None:
-        """From the residuals (N, 4) of these boxes and of those of the same quadrics in the keyframes before."""
+        """From the residuals (N, 4) of these boxes and of those of the same quadrics in keyframes before."""
         for (_, k, j), residual in zip(boxes, residuals, strict=True):
             self.landmarks[j].residuals[k] = residual.copy()  # a view would keep those of all alive
-        rows = [n for n, (_, k, j) in enumerate(boxes) if k - 1 in self.landmarks[j].residuals]
-        if rows:
-            before = np.stack([self.landmarks[j].residuals[k - 1] for _, k, j in (boxes[n] for n in rows)])
-            self.correlation.learn(before, residuals[rows])
+        for lag in LAGS:
+            rows = [n for n, (_, k, j) in enumerate(boxes) if k - lag in self.landmarks[j].residuals]
+            if rows:
+                before = np.stack([self.landmarks[j].residuals[k - lag] for _, k, j in (boxes[n] for n in rows)])
+                self.correlation.learn(before, residuals[rows], lag)
+
+    def _learn_motion(self, k: int) -> None:
+        """What boxes and odometry say of the motion to keyframe k, which is old enough for its boxes to be known."""
+        seen = [j for j, known in self.landmarks.items() if k in known.boxes]
+        information = pose_information(
+            self.pose(k), [self.quadric(j) for j in seen], [self.landmarks[j].boxes[k] for j in seen], self._K
+        )
+        self.correlation.learn_motion(information, self._motions[k - 1].covariance)
 
     def _last(self) -> list[int]:
         """Quadrics in sight, the newest pose and the drift are eliminated last: the next update will touch them again.
