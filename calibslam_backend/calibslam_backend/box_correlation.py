@@ -112,14 +112,14 @@ class BoxCorrelation:
             information: (6, 6) of the boxes, if their quadrics are known.
             covariance: (6, 6) of the motion.
         """
-        volumes = float(np.linalg.det(information @ covariance))
-        if np.isfinite(volumes):
-            ratio = max(volumes, 0.0) ** (1.0 / len(covariance))
-            fading = np.exp(-1.0 / self.KEYFRAMES)
-            # Of the share that boxes have, which is between 0 and 1, and not of a ratio that may be anything.
-            self._told = fading * self._told + ratio / (1.0 + ratio)
-            self._keyframes = fading * self._keyframes + 1.0
-            self._weigh()
+        if not np.isfinite(information).all():
+            return
+        ratio = max(float(np.linalg.det(information @ covariance)), 0.0) ** (1.0 / len(covariance))
+        fading = np.exp(-1.0 / self.KEYFRAMES)
+        # Of the share that boxes have, which is between 0 and 1, and not of a ratio that may be anything.
+        self._told = fading * self._told + ratio / (1.0 + ratio)
+        self._keyframes = fading * self._keyframes + 1.0
+        self._weigh()
 
     def _weigh(self) -> None:
         self.worth = self.understated = 1.0

@@ -44,7 +44,7 @@ def test_slow_part_by_hand() -> None:
 
 
 def test_spectrum_by_hand() -> None:
-    """A single process has (1 + m) / (1 - m) at rest and (1 - m) / (1 + m) at its fastest; then half of it, half white."""
+    """A single process has (1 + m) / (1 - m) at rest, (1 - m) / (1 + m) at its fastest; then half of it."""
     assert spectrum(1.0, 0.5, 0.0) == pytest.approx(3.0)
     assert spectrum(1.0, 0.5, FASTEST) == pytest.approx(1.0 / 3.0)
     assert spectrum(0.5, 0.5, 0.0) == pytest.approx(2.0)
