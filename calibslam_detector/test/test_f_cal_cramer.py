@@ -169,7 +169,35 @@ def test_errors_say_what_is_wrong(n: int, d: int, K: int, text: str) -> None:
         of_residuals(FCalCramer((K,)), normal(n, d))
 
 
+def test_weights_of_the_distances() -> None:
+    """By hand of the distances alone, from the same partitions; 1 each if none are given."""
+    z = 1.2 * normal(400, 4)
+    of_components, of_sums = (float(of_residuals(FCalCramer((K,), generator=generator()), z)) for K in (1, 100))
+    for weights, expected in (
+        ((1.0, 0.01), of_components + 0.01 * of_sums),
+        ((0.0, 2.0), 2.0 * of_sums),
+        (None, of_components + of_sums),
+    ):
+        found = float(of_residuals(FCalCramer((1, 100), weights=weights, generator=generator()), z))
+        assert found == pytest.approx(expected, rel=1e-9)
+
+
+@pytest.mark.parametrize("K", [1, 4, 20])
+def test_evidence_of_true_covariances_is_alike_for_all_sums(K: int) -> None:
+    """The mean of n times the classic statistic is 1/6 for any K, so distances vary as K does; 4 standard errors."""
+    n = 240
+    values = []
+    for seed in range(400):
+        squares = normal(n, 4, seed=seed).square()
+        sums = squares[:, 0] if K == 1 else squares.sum(dim=1).view(-1, K // 4).sum(dim=1)
+        values.append(cramervonmises(sums.numpy(), "chi2", args=(K,)).statistic)
+    assert abs(np.mean(values) - 1.0 / 6.0) < 4.0 * np.std(values) / math.sqrt(len(values)) < 0.04
+
+
 def test_settings_are_checked() -> None:
+    for weights in ((1.0,), (1.0, -1.0)):
+        with pytest.raises(CalibrationError, match="each K needs a weight"):
+            FCalCramer((1, 100), weights=weights)
     for degrees, partitions in (((), 1), ((0,), 1), ((1,), 0)):
         with pytest.raises(CalibrationError, match="must be positive"):
             FCalCramer(degrees, partitions)

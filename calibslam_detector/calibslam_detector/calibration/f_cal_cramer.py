@@ -50,22 +50,35 @@ class FCalCramer(nn.Module):
     partitions make the estimate less noisy. Each distance is without bias in a batch of independent rows, as drawn
     with or without replacement: f-Cal's finite-population flaw has no counterpart here.
 
+    Where no sigmas make all distances vanish, as with outliers that cannot be foreseen, weights say which matter. A
+    weight of 1/K is that of the evidence: the classic statistics, n times the distance of n sums, all have the same
+    distribution where covariances are true, and a batch has n in proportion to 1/K.
+
     Args:
         degrees: K of each distance: 1, or a multiple of d.
         partitions: of the batch, for each K above d.
+        weights: of each distance; None: 1.
         generator: of the partitions, on the CPU; None: torch's own.
     """
 
     def __init__(
-        self, degrees: Sequence[int] = (1, 100), partitions: int = 4, *, generator: torch.Generator | None = None
+        self,
+        degrees: Sequence[int] = (1, 100),
+        partitions: int = 4,
+        *,
+        weights: Sequence[float] | None = None,
+        generator: torch.Generator | None = None,
     ) -> None:
         super().__init__()
         if not degrees or min(degrees) < 1 or partitions < 1:
             raise CalibrationError(f"K and partitions must be positive; got K = {degrees}, partitions = {partitions}")
+        self.weights = (1.0,) * len(degrees) if weights is None else tuple(weights)
+        if len(self.weights) != len(degrees) or min(self.weights) < 0.0:
+            raise CalibrationError(f"each K needs a weight of at least 0; got K = {degrees}, weights = {self.weights}")
         self.degrees, self.partitions, self.generator = tuple(degrees), partitions, generator
 
     def forward(self, mean: Tensor, covariance: Tensor, target: Tensor) -> Tensor:
-        """Sum of the distances of a batch, a scalar.
+        """Weighted sum of the distances of a batch, a scalar.
 
         Args:
             mean, target: (N, d), enough for two sums.
@@ -75,7 +88,8 @@ class FCalCramer(nn.Module):
             CalibrationError: too few residuals, or what `standardised` refuses.
         """
         squares = standardised(mean, covariance, target).square()
-        return torch.stack([self._distance(squares, K) for K in self.degrees]).sum()
+        distances = [w * self._distance(squares, K) for K, w in zip(self.degrees, self.weights, strict=True)]
+        return torch.stack(distances).sum()
 
     def _distance(self, squares: Tensor, K: int) -> Tensor:
         """Distance of sums of K of the squares (N, d)."""
