@@ -200,7 +200,8 @@ class Estimator:
         return self._graph.odometry()
 
     def pose_covariance(self, index: int) -> Array:
-        """(6, 6) [rotation, translation] of a keyframe in its camera frame."""
+        """(6, 6) [rotation, translation] of a keyframe in its camera frame, with what the graph understates of errors
+        that are alike (`box_correlation`)."""
         return self._graph.correlation.understated * self._graph.pose_covariance(index)
 
     def object_map(self) -> ObjectMap:
@@ -216,7 +217,7 @@ class Estimator:
         )
 
     def quadrics(self) -> list[QuadricEstimate]:
-        """The map."""
+        """The map; covariances as of poses."""
         result = []
         understated = self._graph.correlation.understated
         for j, covariance in self._graph.quadric_covariances().items():
