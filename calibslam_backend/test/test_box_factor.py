@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from numerical import assert_jacobians
 
 from calibslam_backend.box_correlation import BoxCorrelation
-from calibslam_backend.box_factor import INVISIBLE, box_factor, box_tangents, whitened_residual
+from calibslam_backend.box_factor import INVISIBLE, box_factor, box_tangents, pose_information, whitened_residual
 from calibslam_backend.box_measurement import BoxMeasurement
 from calibslam_backend.quadric import ALL_EDGES, Ellipsoid, box_of_visible_part, image_bounds
 from calibslam_msgs_py.measurements import Array
@@ -173,3 +173,19 @@ def test_a_box_like_its_neighbours_counts_less(size: float) -> None:
     np.testing.assert_allclose(tangent.jacobian()[1], b, atol=1e-12)
     np.testing.assert_allclose(residuals, -linearised(alone, values)[1][None], atol=1e-12)
     np.testing.assert_allclose(residuals, box_tangents(*arrays)[1])
+
+
+def test_information_of_boxes_on_a_pose() -> None:
+    """The sum of J^T J of their factors by the pose, doubted or not; an invisible one adds nothing."""
+    whitener = np.linalg.inv(np.linalg.cholesky(COVARIANCE))
+    quadrics = [quadric_at(*place) for place in [(0.1, 0.05, 2.0), (-0.4, 0.3, 2.5), (0.1, 0.05, -2.0)]]
+    corners = [predicted(quadrics[0]) + 50.0, predicted(quadrics[1]) + 1.0, np.array([10.0, 10.0, 20.0, 20.0])]
+    boxes = [BoxMeasurement(each, whitener, BOUNDS, ~ALL_EDGES) for each in corners]
+    expected = np.zeros((6, 6))
+    for quadric, box in zip(quadrics[:2], boxes, strict=False):
+        J = linearised(box_factor(X, Q, box, K, 1e6), values_of(POSE, quadric))[0][:, :6]
+        expected += J.T @ J
+    found = pose_information(POSE.matrix(), quadrics, boxes, K)
+    np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-9 * expected.max())
+    assert np.linalg.eigvalsh(found).min() > 0.0
+    np.testing.assert_array_equal(pose_information(POSE.matrix(), [], [], K), np.zeros((6, 6)))
