@@ -82,6 +82,7 @@ class BoxCorrelation:
     DOUBT = 100.0  # pairs of boxes that show no correlation, to begin with
     KEYFRAMES = 100.0  # over which the share of boxes in what is known of motions is averaged
     BEFORE = 10.0  # keyframes in which boxes say nothing of motions, to begin with
+    ALL = 1.0 - 1e-9  # the largest share: motions are known by boxes alone
 
     def __init__(self, is_estimated: bool = True) -> None:
         """Of nothing yet; if it is not to be estimated, errors are taken for independent."""
@@ -114,7 +115,8 @@ class BoxCorrelation:
         """
         if not np.isfinite(information).all():
             return
-        ratio = max(float(np.linalg.det(information @ covariance)), 0.0) ** (1.0 / len(covariance))
+        sign, logarithm = np.linalg.slogdet(information @ covariance)
+        ratio = float(np.exp(logarithm / len(covariance))) if sign > 0.0 else 0.0  # 0: a direction that no box tells
         fading = np.exp(-1.0 / self.KEYFRAMES)
         # Of the share that boxes have, which is between 0 and 1, and not of a ratio that may be anything.
         self._told = fading * self._told + ratio / (1.0 + ratio)
@@ -136,7 +138,7 @@ class BoxCorrelation:
     @property
     def ratio(self) -> float:
         """How much more boxes know of a motion from keyframe to keyframe than odometry."""
-        told = self._told / self._keyframes
+        told = min(self._told / self._keyframes, self.ALL)
         return told / (1.0 - told)
 
     def _correlation(self, lag: int) -> float:

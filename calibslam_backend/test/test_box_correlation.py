@@ -121,6 +121,19 @@ def test_ratio_of_informations_by_hand() -> None:
     assert found.ratio < before
 
 
+@pytest.mark.parametrize("information", [0.0, 1e-300, 1e60, 1e300])
+def test_extreme_information_is_survived(information: float) -> None:
+    """For so long that what it began with has faded."""
+    found = BoxCorrelation()
+    for _ in range(6000):
+        found.learn_motion(information * np.eye(6), 1e-6 * np.eye(6))
+    errors = autoregressive(0.5, 4000, 2)
+    found.learn(errors[:, 0], errors[:, 1])
+    assert np.isfinite(found.ratio)
+    assert 0.3 < found.worth <= 1.0 <= found.understated < 2.0
+    assert (found.worth == 1.0) == (information > 1.0)
+
+
 def test_better_odometry_makes_boxes_that_err_alike_count_less() -> None:
     worths = []
     for ratio in (100.0, 1.0, 0.3, 0.1, 0.001):
