@@ -200,9 +200,8 @@ class Estimator:
         return self._graph.odometry()
 
     def pose_covariance(self, index: int) -> Array:
-        """(6, 6) [rotation, translation] of a keyframe in its camera frame, with what the graph understates of errors
-        that are alike (`box_correlation`)."""
-        return self._graph.correlation.understated * self._graph.pose_covariance(index)
+        """(6, 6) [rotation, translation] of a keyframe in its camera frame."""
+        return self._graph.pose_covariance(index)
 
     def object_map(self) -> ObjectMap:
         """Everything that is estimated, with covariances."""
@@ -217,9 +216,8 @@ class Estimator:
         )
 
     def quadrics(self) -> list[QuadricEstimate]:
-        """The map; covariances as of poses."""
+        """The map."""
         result = []
-        understated = self._graph.correlation.understated
         for j, covariance in self._graph.quadric_covariances().items():
             vector = self._graph.quadric(j)
             ellipsoid = Ellipsoid.from_vector(vector)
@@ -229,7 +227,7 @@ class Estimator:
                     self._assignments.class_of_quadric(j),
                     ellipsoid.T_world_object,
                     ellipsoid.radii,
-                    covariance_of_pose_and_radii(vector, understated * covariance),
+                    covariance_of_pose_and_radii(vector, covariance),
                     len(self._graph.landmarks[j].boxes),
                 )
             )

@@ -184,25 +184,29 @@ class ObjectGraph:
         return self._smoother.has(("prior", j))
 
     def pose_covariance(self, k: int) -> Array:
-        """(6, 6) [rotation, translation] of keyframe k in its body."""
-        return self._smoother.marginal(_x(k))
+        """(6, 6) [rotation, translation] of keyframe k in its body, with what the tree understates of errors that are
+        alike."""
+        return self.correlation.understated * self._smoother.marginal(_x(k))
 
     def distance(self, k: int, T_map_camera: Array) -> float:
-        """Mahalanobis distance of keyframe k from where it is estimated to be, if it were at this pose (4, 4)."""
+        """Mahalanobis distance of keyframe k from where it is estimated to be, if it were at this pose (4, 4); by the
+        tree's own covariance, as all gates."""
         difference = gtsam.Pose3(self.pose(k)).localCoordinates(gtsam.Pose3(T_map_camera))
-        return float(np.sqrt(difference @ np.linalg.solve(self.pose_covariance(k), difference)))
+        return float(np.sqrt(difference @ np.linalg.solve(self._smoother.marginal(_x(k)), difference)))
 
     def quadric_covariances(self) -> dict[int, Array]:
-        """For each quadric (9, 9) of its vector; its prior's where no update has been done yet."""
+        """For each quadric (9, 9) of its vector, like those of poses; its prior's where no update has been done yet."""
         solved = [j for j in self.landmarks if self.is_solved(j)]
         joint = self._smoother.joint([_q(j) for j in solved]) if solved else None
-        return {
+        own = {
             j: np.asarray(joint.at(_q(j), _q(j))) if joint is not None and self.is_solved(j) else landmark.prior
             for j, landmark in self.landmarks.items()
         }
+        return {j: self.correlation.understated * covariance for j, covariance in own.items()}
 
     def joint_covariances(self, k: int, quadrics: list[int]) -> list[Array]:
-        """For each of these quadrics (15, 15) of pose k and the quadric: columns of `quadric.box_of_visible_part`."""
+        """For each of these quadrics (15, 15) of pose k and the quadric: columns of `quadric.box_of_visible_part`; the
+        tree's own, for gates."""
         if not quadrics:
             return []
         x = _x(k)

@@ -20,8 +20,8 @@ from pathlib import Path
 import helpers_on_path  # noqa: F401
 import numpy as np
 from calibslam_msgs.srv import SaveMap
-from live import Watcher, random_domain, wait_until
-from live_graph import ASK_FOR_KEPT, DATA, Player, backend, recording_of, truth_of
+from live import Watcher, kept, random_domain, wait_until
+from live_graph import DATA, Player, backend, recording_of, truth_of
 
 from calibslam_backend.metrics import Trajectory, ate
 from calibslam_backend.object_map import ObjectMap
@@ -39,7 +39,7 @@ def run(recording: Recording, truth: Trajectory, moments: list[float], rate: flo
     images = sum(isinstance(m, Boxes) for m in measurements)
     domain = random_domain()
     parameters = [f"journal:={scratch / 'journal'}", f"map_folder:={scratch}", f"refine_after:={REFINE_AFTER}"]
-    parameters += ASK_FOR_KEPT
+    parameters += kept("/detections", "/relative_pose")
     with Watcher(domain) as watcher:
         player = Player(watcher, recording.camera)
         process = backend(domain, *parameters)

@@ -27,9 +27,6 @@ TYPES = RosTypes()
 TICKS = os.sysconf("SC_CLK_TCK")
 # Publishers keep all of a recording for a back end that was away.
 KEPT = QoSProfile(depth=5000, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-ASK_FOR_KEPT = [
-    f"qos_overrides.{topic}.subscription.durability:=transient_local" for topic in ("/detections", "/relative_pose")
-]
 
 
 @contextmanager

@@ -88,5 +88,5 @@ def quadric_nees(done: Run) -> list[float]:
     for j, covariance in graph.quadric_covariances().items():
         true = objects[boxes[j].most_common(1)[0][0]]
         error = graph.quadric(j) - Ellipsoid(to_map @ true.T_world_object, true.radii).vector()
-        result.append(float(error @ np.linalg.solve(graph.correlation.understated * covariance, error)))
+        result.append(float(error @ np.linalg.solve(covariance, error)))
     return result

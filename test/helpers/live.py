@@ -55,16 +55,19 @@ def keeping_all(topic: str) -> list[str]:
     return ["--ros-args", "-p", f"qos_overrides.{topic}.publisher.depth:=5000"]
 
 
-def asking_for_kept(*topics: str) -> list[str]:
-    """Arguments for a node that subscribes to these: it also gets what was published before it was connected.
+def kept(*topics: str) -> list[str]:
+    """Parameters, `name:=value`, of a node that subscribes to these: it also gets what was published before it was
+    connected.
 
     A publisher of another process may find a new subscriber only seconds after everybody sees it in the graph, and
     what it publishes until then would be lost.
     """
-    return [
-        "--ros-args",
-        *(part for t in topics for part in ("-p", f"qos_overrides.{t}.subscription.durability:=transient_local")),
-    ]
+    return [f"qos_overrides.{topic}.subscription.durability:=transient_local" for topic in topics]
+
+
+def asking_for_kept(*topics: str) -> list[str]:
+    """The same as arguments."""
+    return ["--ros-args", *(part for parameter in kept(*topics) for part in ("-p", parameter))]
 
 
 class Process:
