@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from calibslam_backend.box_measurement import BORDER, prepare, undistorted
+from calibslam_backend.box_measurement import BORDER, BORDER_SIGMAS, prepare, undistorted
 from calibslam_msgs_py.measurements import Array, Boxes, Camera
 
 # TUM fr1, as published by its authors.
@@ -58,21 +58,31 @@ def test_a_rectified_camera_changes_nothing() -> None:
     assert undistorted(np.empty((0, 4)), FR1).shape == (0, 4)
 
 
+@pytest.mark.parametrize("sigma, margin", [(0.01, BORDER), (4.0, BORDER_SIGMAS * 4.0)], ids=["sure", "unsure"])
 @pytest.mark.parametrize("camera", [FR1, RECTIFIED], ids=["distorted", "rectified"])
-def test_edges_on_the_border_are_marked(camera: Camera) -> None:
+def test_edges_on_the_border_are_marked(camera: Camera, sigma: float, margin: float) -> None:
+    """Those nearer to it than three standard deviations, or two pixels."""
+    beyond = margin + 0.1
     corners = np.array(
         [
             [100.0, 100.0, 200.0, 200.0],
-            [BORDER, 100.0, 200.0, 200.0],
+            [margin, 100.0, 200.0, 200.0],
             [100.0, 0.0, 200.0, 200.0],
-            [100.0, 100.0, 640.0 - BORDER, 480.0],
-            [BORDER + 0.1, BORDER + 0.1, 639.9 - BORDER, 479.9 - BORDER],
+            [100.0, 100.0, 640.0 - margin, 480.0],
+            [beyond, beyond, 640.0 - beyond, 480.0 - beyond],
             [-5.0, -5.0, 650.0, 490.0],
         ]
     )
-    clips = np.stack([m.clip for m in prepare(boxes_with(corners, camera), np.tile(np.eye(4), (6, 1, 1)), camera)])
+    covariances = np.tile(np.eye(4) * sigma**2, (6, 1, 1))
+    clips = np.stack([m.clip for m in prepare(boxes_with(corners, camera), covariances, camera)])
     expected = ["0000", "1000", "0100", "0011", "0000", "1111"]
     assert ["".join(str(int(c)) for c in clip) for clip in clips] == expected
+
+
+def test_each_edge_has_its_own_deviation() -> None:
+    corners = np.array([[10.0, 10.0, 630.0, 470.0]])
+    (box,) = prepare(boxes_with(corners), np.diag([16.0, 4.0, 4.0, 16.0])[None], FR1)
+    assert box.clip.tolist() == [True, False, False, True]
 
 
 def test_bounds_are_where_the_border_lies_beside_the_box() -> None:
