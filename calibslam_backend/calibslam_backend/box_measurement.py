@@ -13,10 +13,9 @@ from numpy.typing import NDArray
 
 from calibslam_msgs_py.measurements import Array, Boxes, Camera
 
-# A detector draws the border that cuts an object as inaccurately as the object's own edges: one that is nearer to the
-# border than so many of its standard deviations may be it. Of such edges taken for the object's own, 36 % (fr3_office) and
-# 48 % (fr1_desk) are gross errors within one deviation of the border, 13 and 16 % between two and three, 6 and 8 % between
-# three and four, 5 and 6 % far away (test/benchmarks/border_edges.py).
+# A detector draws the border that cuts an object as inaccurately as the object's own edges: an edge nearer to the border
+# than so many of its standard deviations may be it. (Taken for the object's own, two fifths of those within one are
+# gross errors on real recordings, a seventh between two and three, and as few as anywhere else beyond; docs/method.md.)
 BORDER_SIGMAS = 3.0
 BORDER = 2.0  # [px], for detectors that are sure of themselves
 

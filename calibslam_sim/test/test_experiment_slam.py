@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
 
@@ -11,7 +12,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from calibslam_backend.object_map import ObjectMap
-from calibslam_msgs_py.measurements import Array, QuadricEstimate
+from calibslam_msgs_py.measurements import Array, Boxes, Camera, QuadricEstimate
 from calibslam_sim import experiment
 from calibslam_sim.experiments import quadric_sim, tum
 from calibslam_sim.experiments.design import ExperimentError, repetition_seed
@@ -116,6 +117,26 @@ def test_tum_backwards_undoes_every_motion(folder: Path) -> None:
     np.testing.assert_allclose(again.odometry[5].T_start_end, forwards.odometry[5].T_start_end, atol=1e-12)
 
 
+def test_tum_gives_few_conditions_a_third_of_the_images(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    settings = tum.TumSettings(folder=str(folder))
+    given: dict[str, list[int]] = {}
+
+    class Counted(Exception):
+        pass
+
+    def counting(name: str, camera: Camera, motions: object, images: list[Boxes], back_end: object) -> ObjectMap:
+        given[name] = [boxes.stamp for boxes in images]
+        raise Counted
+
+    for name in ("real_given_fixed", "few_given_fixed", "few_given_calibrated"):
+        monkeypatch.setattr(tum, "estimate", partial(counting, name))
+        with pytest.raises(Counted):
+            tum.run(settings, name, 3)
+    count = len(tum.recorded(settings).images)
+    assert len(given["few_given_fixed"]) < 0.5 * count < 0.8 * count < len(given["real_given_fixed"]) < count
+    assert given["few_given_calibrated"] == given["few_given_fixed"]  # conditions are compared on the same images
+
+
 def test_tum_command(folder: Path, tmp_path: Path) -> None:
     arguments = ["tum", "--quick", "--folder", str(folder), "--seeds", "1", "--jobs", "1", "--out", str(tmp_path)]
     assert experiment.main(arguments) == 0
@@ -127,6 +148,7 @@ def test_tum_command(folder: Path, tmp_path: Path) -> None:
         "real_given_fixed",
         "real_estimated_calibrated",
         "backwards_estimated_fixed",
+        "few_estimated_quadricslam",
     } <= set(result["conditions"])
     assert "backwards_given_calibrated_vs_backwards_given_fixed" in result["paired"]
     for metrics in result["conditions"].values():

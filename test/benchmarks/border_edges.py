@@ -10,6 +10,7 @@ there are, their mean error, negative inside, and how many are off by more than 
 from __future__ import annotations
 
 import argparse
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -33,13 +34,14 @@ def main() -> None:
             corners = image.boxes.corners
             extents = np.tile(corners[:, 2:] - corners[:, :2], 2)
             stated = np.hypot(settings.stated_floor, settings.stated_share * extents)
-            to_border = np.concatenate([corners[:, :2], [image.boxes.width, image.boxes.height] - corners[:, 2:]], axis=1)
+            size = [image.boxes.width, image.boxes.height]
+            to_border = np.concatenate([corners[:, :2], size - corners[:, 2:]], axis=1)
             known = np.isfinite(image.errors)
             errors.append((OUTWARDS * image.errors / stated)[known])
             distances.append((to_border / stated)[known])
         error, distance = np.concatenate(errors), np.concatenate(distances)
         print(f"{bag.name}: {len(error)} edges")
-        for low, high in zip(DISTANCES, DISTANCES[1:], strict=False):
+        for low, high in pairwise(DISTANCES):
             chosen = error[(distance > low) & (distance <= high)]
             if len(chosen):
                 gross = np.mean(np.abs(chosen) > GROSS)

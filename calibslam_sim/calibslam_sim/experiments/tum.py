@@ -8,10 +8,12 @@ Families of conditions:
     backwards_given_..., backwards_estimated_...: the same, and the recording played from its end. Its boxes and the
         errors of its odometry are the same; what is known when, and so which objects begin and who takes which box,
         is not. What hangs on the order of things shows here.
+    few_given_..., few_estimated_...: every third image only, drawn at random, as a detector a third as fast would give.
 Two more, real_given_underconfident and real_given_scale_4, believe calibrated deviations to be 2 and 4 times as large:
 if errors are alike from image to image, what is right for each box is too confident for a row of them.
-With real odometry each repetition leaves out another tenth of the images: their spread tells how far a result hangs
-on single images, not how it would be on other recordings.
+With real odometry each repetition leaves out another tenth of the images (`few_`: two thirds): their spread tells how
+far a result hangs on single images, not how it would be on other recordings. Two repetitions share nine tenths of their
+images, and a third where there are few: these are nearer to repetitions that know nothing of each other.
 """
 
 from __future__ import annotations
@@ -60,13 +62,15 @@ NOISE = {
     UNDERCONFIDENT: (OWN_COVARIANCE, 2.0),
     scale_name(4.0): (OWN_COVARIANCE, 4.0),
 }
-REAL_GIVEN, BACKWARDS = "real_given_", "backwards_"
+REAL_GIVEN, BACKWARDS, FEW = "real_given_", "backwards_", "few_"
 # Prefix of a condition -> association.
 REAL = {
     REAL_GIVEN: GIVEN,
     "real_estimated_": ESTIMATED,
     BACKWARDS + "given_": GIVEN,
     BACKWARDS + "estimated_": ESTIMATED,
+    FEW + "given_": GIVEN,
+    FEW + "estimated_": ESTIMATED,
 }
 GROUND_TRUTH, ODOMETRY, DETECTIONS, CAMERA_INFO = (
     "groundtruth.txt",
@@ -86,6 +90,7 @@ class TumSettings(ExperimentSettings):
     rotation_noise: float = setting(0.5, "added to each step of it, about each axis", unit="deg", low=1e-4)
     translation_noise: float = setting(0.01, "added to each step of it, along each axis", unit="m", low=1e-6)
     left_out: float = setting(0.1, "share of images left out where odometry is real", low=0.0, high=0.9)
+    left_out_of_few: float = setting(2.0 / 3.0, "the same in `few_` conditions", low=0.0, high=0.9)
     most_images: int = setting(1_000_000, "of the recording, from its beginning", low=10)
 
 
@@ -129,7 +134,8 @@ def run(settings: TumSettings, condition: str, seed: Seed) -> Metrics:
         recording = recording.backwards
     motions, images = recording.odometry, recording.images
     if family:
-        kept = rng.random(len(images)) >= settings.left_out
+        left_out = settings.left_out_of_few if family.startswith(FEW) else settings.left_out
+        kept = rng.random(len(images)) >= left_out
         images = [boxes for boxes, keep in zip(images, kept, strict=True) if keep]
     else:
         noise = OdometryNoise(np.radians(settings.rotation_noise), settings.translation_noise)
