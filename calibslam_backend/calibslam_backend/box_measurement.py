@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from calibslam_msgs_py.measurements import Array, Boxes, Camera
 
-# A detector draws the border that cuts an object as inaccurately as the object's own edges: an edge nearer to the border
-# than so many of its standard deviations may be it. (Taken for the object's own, two fifths of those within one are
+# A detector draws the border that cuts an object as inaccurately as the object's own edges: an edge nearer to it than
+# so many of its standard deviations may be the border. (Taken for the object's own, two fifths of those within one are
 # gross errors on real recordings, a seventh between two and three, and as few as anywhere else beyond; docs/method.md.)
 BORDER_SIGMAS = 3.0
 BORDER = 2.0  # [px], for detectors that are sure of themselves
