@@ -48,8 +48,8 @@ class Detector:
     ) -> list[Boxes]:
         """The boxes of each image, taken at `times` (F,) [ns] from poses (F, 4, 4).
 
-        An edge that the image border cuts lies exactly on the border. Of the others, the error has the stated
-        covariance (before boxes are cut at the border, which can only bring them nearer to it).
+        Errors have the stated covariance before boxes are cut at the border. So the border that cuts an object is drawn
+        as inaccurately as its own edges, half of the time inside the image, as real detectors do.
         """
         whole, visible = _project_all(camera, world, T_world_camera)
         hidden = hidden_shares([o.ellipsoid for o in world], T_world_camera[:, :3, 3])
@@ -89,7 +89,7 @@ class Detector:
                 stamp=int(time),
                 width=camera.width,
                 height=camera.height,
-                corners=visible[f, seen] + np.where(on_border[f, seen], 0.0, errors),
+                corners=visible[f, seen] + errors,
                 covariances=covariances[f, seen],
                 class_ids=tuple(world[i].class_id for i in seen),
                 scores=scores[f, seen],

@@ -96,7 +96,8 @@ def find_sightings(
     rows: list[tuple[int, int, int]] = []
     corners, errors, covariances = [], [], []
     for k, (boxes, pose) in enumerate(zip(images, np.ascontiguousarray(poses), strict=True)):
-        measured = prepare(boxes, np.tile(np.eye(4), (len(boxes), 1, 1)), camera)
+        stated = np.where(boxes.has_covariance[:, None, None], boxes.covariances, np.eye(4))
+        measured = prepare(boxes, stated, camera)
         predicted = [[predicted_corners(pose, vector, camera.K, box) for box in measured] for vector in vectors]
         cost = np.full((len(vectors), len(measured)), np.inf)
         for q, of_quadric in enumerate(predicted):
