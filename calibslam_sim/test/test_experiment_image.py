@@ -28,6 +28,7 @@ def a_detector(path: Path, detector_seed: int, head_seed: int) -> Path:
         model.detector.roi_heads.box_predictor.cls_score.bias[1] = 5.0
         torch.manual_seed(head_seed)
         model.covariance_head.output.weight.normal_(std=0.1)
+        model.familiarity.mean.normal_()  # heads learn from different images
     weights_file.save(model, path)
     return path
 

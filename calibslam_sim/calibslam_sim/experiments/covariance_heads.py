@@ -17,7 +17,8 @@ from calibslam_msgs_py.covariance import symmetric
 from calibslam_msgs_py.measurements import Boxes
 from calibslam_sim.experiments.design import ExperimentError
 
-HEAD = "covariance_head."  # begin of the names of its weights
+# Begins of the names of what does not find boxes: what is said of them, and which images are usual.
+NOT_OF_DETECTOR = ("covariance_head.", "familiarity.")
 
 
 class CovarianceHeads:
@@ -73,8 +74,8 @@ class CovarianceHeads:
 
 
 def _same_detector(a: CalibratedDetector, b: CalibratedDetector) -> bool:
-    """Whether all but the covariance heads is the same."""
+    """Whether they find the same boxes."""
     if (a.architecture, a.class_names) != (b.architecture, b.class_names):
         return False
     ours, theirs = a.state_dict(), b.state_dict()
-    return all(torch.equal(ours[name], theirs[name]) for name in ours if not name.startswith(HEAD))
+    return all(torch.equal(ours[name], theirs[name]) for name in ours if not name.startswith(NOT_OF_DETECTOR))
