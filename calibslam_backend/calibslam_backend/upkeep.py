@@ -160,7 +160,7 @@ class Upkeep:
         keyframes = self._graph.landmarks[j].boxes
         others: dict[int, int | None] = {}
         lost = 0.0
-        for k in keyframes:
+        for k in reversed(keyframes):  # of an object in sight the newest have not been judged yet
             frame = books.frames[k]
             fits = books.tracks[frame.tracks[books.row(k, j)]].evidence.fits(k)
             if fits is None:
