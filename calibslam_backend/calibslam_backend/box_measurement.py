@@ -70,7 +70,6 @@ def undistorted(corners: Array, camera: Camera) -> Array:
 
 def prepare(boxes: Boxes, covariances: Array, camera: Camera) -> list[BoxMeasurement]:
     """The boxes of one image with the covariances (N, 4, 4) [px^2] to be used for them."""
-    deviations = np.sqrt(np.diagonal(covariances, axis1=1, axis2=2))
     corners = undistorted(boxes.corners, camera)
     image = np.array([0.0, 0.0, camera.width, camera.height])
     x = 0.5 * (boxes.corners[:, 0] + boxes.corners[:, 2])
@@ -80,7 +79,7 @@ def prepare(boxes: Boxes, covariances: Array, camera: Camera) -> list[BoxMeasure
     vertical = undistorted(np.stack([zero, 2 * y - image[3], zero + image[2], image[3] + zero], axis=1), camera)
     horizontal = undistorted(np.stack([2 * x - image[2], zero, image[2] + zero, zero + image[3]], axis=1), camera)
     bounds = np.stack([vertical[:, 0], horizontal[:, 1], vertical[:, 2], horizontal[:, 3]], axis=1)
-    to_border = np.concatenate([boxes.corners[:, :2], image[2:] - boxes.corners[:, 2:]], axis=1)
-    clip = to_border <= np.maximum(BORDER, BORDER_SIGMAS * deviations)
+    deviations = np.sqrt(np.diagonal(covariances, axis1=1, axis2=2))
+    clip = boxes.to_border <= np.maximum(BORDER, BORDER_SIGMAS * deviations)
     whiteners = np.linalg.inv(np.linalg.cholesky(covariances))
     return [BoxMeasurement(*each) for each in zip(corners, whiteners, bounds, clip, strict=True)]

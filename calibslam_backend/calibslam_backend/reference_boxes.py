@@ -41,6 +41,11 @@ class ReferenceSettings(InitialisationSettings, TrackingSettings):
         0.5, "median intersection over union of a track's boxes and those of its object", low=0.0, high=1.0
     )
 
+    def stated_variances(self, corners: Array) -> Array:
+        """(N, 4) of the edges of boxes (N, 4) [px^2]."""
+        extents = np.tile(corners[:, 2:] - corners[:, :2], 2)
+        return np.asarray(self.stated_floor**2 + (self.stated_share * extents) ** 2)
+
 
 @dataclass(frozen=True)
 class Referenced:
@@ -49,7 +54,7 @@ class Referenced:
     Attributes:
         boxes: all of the image, also those without reference.
         errors: (N, 4) measured minus reference [px], undistorted; NaN for an edge that has no reference, since the
-            box belongs to no object or the edge to the border of the image.
+            box belongs to no object or the edge may belong to the border of the image.
         objects: (N,) number of the object, NONE where unknown.
     """
 
@@ -110,8 +115,7 @@ class _Fit:
         self._images, self._poses, self._K, self._settings = images, poses, camera.K, settings
         self._measured: list[list[BoxMeasurement]] = []
         for image in images:
-            extents = np.tile(image.corners[:, 2:] - image.corners[:, :2], 2)
-            variances = settings.stated_floor**2 + (settings.stated_share * extents) ** 2
+            variances = settings.stated_variances(image.corners)
             self._measured.append(prepare(image, np.eye(4) * variances[:, None, :], camera))
 
     def result(self) -> list[Referenced]:

@@ -79,6 +79,11 @@ def test_edges_on_the_border_are_marked(camera: Camera, sigma: float, margin: fl
     assert ["".join(str(int(c)) for c in clip) for clip in clips] == expected
 
 
+def test_distances_to_the_border_by_hand() -> None:
+    found = boxes_with(np.array([[10.0, 20.0, 600.0, 470.0], [-5.0, 0.0, 650.0, 480.0]])).to_border
+    np.testing.assert_array_equal(found, [[10.0, 20.0, 40.0, 10.0], [-5.0, 0.0, -10.0, 0.0]])
+
+
 def test_each_edge_has_its_own_deviation() -> None:
     corners = np.array([[10.0, 10.0, 630.0, 470.0]])
     (box,) = prepare(boxes_with(corners), np.diag([16.0, 4.0, 4.0, 16.0])[None], FR1)

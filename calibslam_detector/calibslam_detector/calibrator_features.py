@@ -25,7 +25,7 @@ def edge_features(boxes: Boxes, least_extent: float = 1e-3, most_extent: float =
     size = np.array([boxes.width, boxes.height], float)
     extents = corners[:, 2:] - corners[:, :2]
     logarithms = np.log(np.clip(extents, least_extent, most_extent) / REFERENCE_EXTENT)
-    touching = np.concatenate([corners[:, :2] <= BORDER, corners[:, 2:] >= size - BORDER], axis=1)
+    touching = boxes.to_border <= BORDER
     others = touching.sum(axis=1, keepdims=True) - touching > 0
     middle = 0.5 * (corners[:, :2] + corners[:, 2:])
     place = np.minimum(np.linalg.norm(middle - size / 2, axis=1) / np.linalg.norm(size / 2), 1.0)

@@ -76,6 +76,11 @@ class Boxes:
         """(N,) whether the covariance of a box is known."""
         return ~np.isnan(self.covariances[:, 0, 0])
 
+    @property
+    def to_border(self) -> Array:
+        """(N, 4) how far the edges xmin ymin xmax ymax are inside the border of the image [px]."""
+        return np.concatenate([self.corners[:, :2], [self.width, self.height] - self.corners[:, 2:]], axis=1)
+
     def select(self, indices: NDArray[np.int_]) -> Boxes:
         """The boxes with these indices, in this order."""
         return replace(

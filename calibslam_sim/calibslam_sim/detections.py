@@ -57,12 +57,11 @@ class Detector:
         whole_sizes = whole[..., 2:] - whole[..., :2]
         in_image = np.nan_to_num(np.prod(sizes, axis=-1) / np.prod(whole_sizes, axis=-1))
         bounds = image_bounds(camera.width, camera.height)
-        on_border = visible == bounds
         covariances = self.noise.covariances(
             BoxConditions(
                 extents=sizes,
                 hidden=hidden,
-                is_cut=on_border.any(axis=-1),
+                is_cut=(visible == bounds).any(axis=-1),
                 image_motion=_image_motion(whole),
                 edge_difficulty=np.array([o.edge_difficulty for o in world]),
                 edge_correlation=np.array([o.edge_correlation for o in world]),

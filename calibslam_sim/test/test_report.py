@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from calibslam_backend.box_measurement import BORDER_SIGMAS
 from calibslam_backend.object_map import ObjectMap
 from calibslam_backend.quadric import Ellipsoid, project
 from calibslam_msgs_py.bags import BagReader, BagWriter
@@ -292,7 +293,7 @@ def test_boxes_find_their_quadrics() -> None:
     pose, image = SIMULATION.T_world_camera[k], SIMULATION.boxes[k]
     ids = [int(i) for i in image.object_ids]
     corners = exact(image, pose, ids).corners
-    margin = 3.0 * 2.0 + 0.1  # three deviations of an exact box: nearer edges may be the border's
+    margin = BORDER_SIGMAS * 2.0 + 0.1  # nearer edges may be the border's
     whole = (corners > margin).all(axis=1) & (corners < np.tile([CAMERA.width, CAMERA.height], 2) - margin).all(axis=1)
     ids = [i for i, free in zip(ids, whole, strict=True) if free]
     measured = exact(image, pose, ids)

@@ -31,14 +31,10 @@ def main() -> None:
     for bag in parser.parse_args().bags:
         errors, distances = [], []
         for image in of_recording(bag):
-            corners = image.boxes.corners
-            extents = np.tile(corners[:, 2:] - corners[:, :2], 2)
-            stated = np.hypot(settings.stated_floor, settings.stated_share * extents)
-            size = [image.boxes.width, image.boxes.height]
-            to_border = np.concatenate([corners[:, :2], size - corners[:, 2:]], axis=1)
+            stated = np.sqrt(settings.stated_variances(image.boxes.corners))
             known = np.isfinite(image.errors)
             errors.append((OUTWARDS * image.errors / stated)[known])
-            distances.append((to_border / stated)[known])
+            distances.append((image.boxes.to_border / stated)[known])
         error, distance = np.concatenate(errors), np.concatenate(distances)
         print(f"{bag.name}: {len(error)} edges")
         for low, high in pairwise(DISTANCES):

@@ -34,7 +34,7 @@ class Sightings:
         box: (M,) number of the box in its image.
         quadric: (M,) number of the quadric.
         corners: (M, 4) measured, undistorted [px].
-        errors: (M, 4) measured minus projected [px]; NaN for an edge on the border of the image.
+        errors: (M, 4) measured minus projected [px]; NaN for an edge that may be the border of the image.
         covariances: (M, 4, 4) that the boxes carry [px^2]; NaN where unknown.
     """
 
