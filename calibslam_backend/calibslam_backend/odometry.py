@@ -19,15 +19,13 @@ from dataclasses import dataclass
 import gtsam
 import numpy as np
 
+from calibslam_backend.odometry_failures import FailureFilter, FailureSettings
 from calibslam_msgs_py.measurements import SECOND, Array, InvalidMeasurement, RelativeMotion
-from calibslam_msgs_py.settings import Settings, setting
-
-SHORTEST = 0.03  # [s]: in shorter motions, noise looks like acceleration
-EXPLAINED = 3.0  # standard deviations
+from calibslam_msgs_py.settings import setting
 
 
 @dataclass(frozen=True)
-class MotionNoise(Settings):
+class MotionNoise(FailureSettings):
     """Standard deviations of a motion whose covariance is unknown: sqrt(floor^2 + (share * motion)^2), and those of
     the drift that all such motions share. Both are of errors that are independent of each other at the scene,
     `scene_depth` in front of the camera on its optical axis."""
@@ -43,37 +41,6 @@ class MotionNoise(Settings):
     drift_translation: float = setting(
         0.003, "unknown odometry noise: constant drift in translation", unit="m/s", low=1e-9
     )
-
-    max_speed: float = setting(
-        100.0, "speed that a body can have: a faster motion is a failure of odometry", unit="m/s", low=0.1
-    )
-    max_acceleration: float = setting(
-        30.0, "change of velocity from one motion to the next that a body can do: 3 g", unit="m/s^2", low=0.1
-    )
-    max_angular_acceleration: float = setting(
-        100.0, "change of angular velocity from one motion to the next that a body can do", unit="rad/s^2", low=0.1
-    )
-
-    def is_plausible(self, velocity: Array, before: Array, seconds: float, covariance: Array | None) -> bool:
-        """Whether a body can have these two velocities (6,) [rad/s, m/s] in consecutive motions.
-
-        Args:
-            velocity, before: in the body.
-            seconds: duration of the later one.
-            covariance: (6, 6) of the later motion, if known: what it explains is plausible as well.
-        """
-        seconds = max(seconds, SHORTEST)
-        noise = np.sqrt(2.0) * _explained(covariance, seconds)
-        change = velocity - before
-        return bool(
-            np.linalg.norm(change[:3]) < self.max_angular_acceleration * seconds + np.linalg.norm(noise[:3])
-            and np.linalg.norm(change[3:]) < self.max_acceleration * seconds + np.linalg.norm(noise[3:])
-        )
-
-    def is_possible(self, velocity: Array, seconds: float, covariance: Array | None) -> bool:
-        """Whether a body can be as fast as this; arguments as of `is_plausible`."""
-        noise = _explained(covariance, max(seconds, SHORTEST))
-        return bool(np.linalg.norm(velocity[3:]) < self.max_speed + np.linalg.norm(noise[3:]))
 
     def covariance(self, T_start_end: Array) -> Array:
         """(6, 6) [rotation, translation] for a motion (4, 4) of the camera, at its end."""
@@ -91,11 +58,6 @@ class MotionNoise(Settings):
         T_camera_scene = gtsam.Pose3(gtsam.Rot3(), np.array([0.0, 0.0, self.scene_depth]))
         square_root = T_camera_scene.AdjointMap() * deviations
         return np.asarray(square_root @ square_root.T)
-
-
-def _explained(covariance: Array | None, seconds: float) -> Array:
-    """(6,) error of a velocity that the covariance (6, 6) of its motion explains."""
-    return np.zeros(6) if covariance is None else EXPLAINED * np.sqrt(np.diag(covariance)) / seconds
 
 
 class OdometryDifferencer:
@@ -161,15 +123,14 @@ class MotionChain:
 
     Times inside a step are interpolated along the geodesic, its covariance in proportion.
 
-    A step that no body can make, by its change of velocity both from the last possible step and from the one just
-    before, or by its speed, is a failure of odometry: the body is then taken to go on as it did, and to do unseen what
-    it may.
+    Where odometry fails the body is taken to go on as it did, and to do unseen what it may, see `odometry_failures`.
     """
 
-    # What a body may do unseen, while odometry is missing or fails: 1 rad/s and 1 m/s more or less.
+    # What a body may do unseen, while odometry is missing: 1 rad/s and 1 m/s more or less.
     UNSEEN_MOTION = 1.0
     # A standard deviation [rad, m] of one step that says: not measured.
     OPEN = 1.0
+    SHORTEST = 0.03  # [s] in which a body does what it does unseen, where a direction is left open
 
     def __init__(self, noise: MotionNoise, T_body_camera: Array) -> None:
         self._noise = noise
@@ -178,8 +139,8 @@ class MotionChain:
         self._poses: list[gtsam.Pose3] = []  # camera in the chain's own frame, at those times
         self._measured: list[gtsam.Pose3] = []  # the same, nothing bridged
         self._covariances: list[Array | None] = []  # of the step that ends there
-        self._unseen: list[float] = []  # what the body may have done unseen in that step [rad and m]
-        self._velocities: list[Array] = []  # of the last possible step and of the last one, possible or not
+        self._unseen: list[Array] = []  # (2,) what the body may have done unseen in that step [rad, m]
+        self._failures = FailureFilter(noise, is_visual=noise.scene_depth > 0.0)
 
     @property
     def start(self) -> int | None:
@@ -210,7 +171,7 @@ class MotionChain:
             to_camera = self._extrinsic.inverse().AdjointMap()
             covariance = to_camera @ covariance @ to_camera.T
         if not self._times:
-            self._append(motion.start, gtsam.Pose3(), gtsam.Pose3(), None, 0.0)
+            self._append(motion.start, gtsam.Pose3(), gtsam.Pose3(), None, np.zeros(2))
         last = self._times[-1]
         if motion.start < last:
             raise InvalidMeasurement(
@@ -220,24 +181,17 @@ class MotionChain:
         problem = ""
         if motion.start > last:
             problem = "odometry_gap"
-            unseen = self.UNSEEN_MOTION * (motion.start - last) / SECOND
+            gap = (motion.start - last) / SECOND
+            unseen = np.full(2, self.UNSEEN_MOTION * gap)
             self._append(motion.start, gtsam.Pose3(), gtsam.Pose3(), np.zeros((6, 6)), unseen)
-            self._velocities.clear()
+            self._failures.unseen(gap)
         seconds = (motion.end - motion.start) / SECOND
-        step = self._extrinsic.inverse() * gtsam.Pose3(motion.T_start_end) * self._extrinsic
-        velocity = gtsam.Pose3.Logmap(step) / seconds
-        near = [self._noise.is_plausible(velocity, before, seconds, covariance) for before in self._velocities]
-        if (any(near) or not near) and self._noise.is_possible(velocity, seconds, covariance):
-            self._velocities = [velocity, velocity]
-            closed = None if covariance is None else self._closed(covariance, seconds)
-            self._append(motion.end, step, step, closed, 0.0)
-            return problem
-        coasting = gtsam.Pose3()
-        if self._velocities:
-            self._velocities[1] = velocity
-            coasting = gtsam.Pose3.Expmap(self._velocities[0] * seconds)
-        self._append(motion.end, coasting, step, covariance, self.UNSEEN_MOTION * seconds)
-        return "odometry_implausible"
+        measured = self._extrinsic.inverse() * gtsam.Pose3(motion.T_start_end) * self._extrinsic
+        believed = self._failures.believe(gtsam.Pose3.Logmap(measured) / seconds, seconds, covariance)
+        step = gtsam.Pose3.Expmap(believed.velocity * seconds) if believed.variance.any() else measured
+        closed = None if covariance is None else self._closed(covariance, seconds)
+        self._append(motion.end, step, measured, closed, np.sqrt(believed.variance) * seconds)
+        return "odometry_implausible" if believed.failed > 0.5 else problem
 
     def _closed(self, covariance: Array, seconds: float) -> Array:
         """A covariance (6, 6) with the directions that odometry leaves open bounded by what a body does unseen.
@@ -248,7 +202,7 @@ class MotionChain:
         if np.diag(covariance).max() <= self.OPEN**2:
             return covariance
         variances, axes = np.linalg.eigh(covariance)
-        unseen = (self.UNSEEN_MOTION * max(seconds, SHORTEST)) ** 2
+        unseen = (self.UNSEEN_MOTION * max(seconds, self.SHORTEST)) ** 2
         return np.asarray(
             (axes * np.where(variances > self.OPEN**2, np.minimum(variances, unseen), variances)) @ axes.T
         )
@@ -261,13 +215,13 @@ class MotionChain:
         """`motion` and its covariance (6, 6) [rotation, translation]."""
         first, last = self._pose_at(start, self._poses), self._pose_at(end, self._poses)
         motion = first.between(last)
-        covariance, unseen, unknown = np.zeros((6, 6)), 0.0, False
+        covariance, unseen, unknown = np.zeros((6, 6)), np.zeros(2), False
         for i in range(bisect_right(self._times, start), len(self._times)):
             begin, finish = max(start, self._times[i - 1]), min(end, self._times[i])
             if begin >= end:
                 break
             share = (finish - begin) / (self._times[i] - self._times[i - 1])
-            unseen += share * self._unseen[i]  # of one wrong velocity, hence not in squares
+            unseen = unseen + share * self._unseen[i]  # of one wrong velocity, hence not in squares
             known = self._covariances[i]
             if known is None:
                 unknown = True
@@ -276,7 +230,7 @@ class MotionChain:
                 covariance += to_end @ (share * known) @ to_end.T
         if unknown:
             covariance = self._noise.covariance(motion.matrix())
-        return motion.matrix(), covariance + unseen**2 * np.eye(6)
+        return motion.matrix(), covariance + np.diag(np.repeat(unseen**2, 3))
 
     def forget_before(self, time: int) -> None:
         """Drop what is not needed to read times from `time` [ns] on."""
@@ -295,7 +249,7 @@ class MotionChain:
         return (end - start) / SECOND if unknown else 0.0
 
     def _append(
-        self, time: int, step: gtsam.Pose3, measured: gtsam.Pose3, covariance: Array | None, unseen: float
+        self, time: int, step: gtsam.Pose3, measured: gtsam.Pose3, covariance: Array | None, unseen: Array
     ) -> None:
         self._times.append(time)
         self._poses.append(self._poses[-1] * step if self._poses else step)
