@@ -111,8 +111,7 @@ class DataAssociation:
             corners = predicted_corners(T, self._graph.quadric(candidate.quadric), self.camera.K, box)
             # Identities that are given are no matter of where the camera is thought to be.
             fits = corners is not None and (
-                self.settings.association == GIVEN
-                or overlap(corners[None], box.corners[None])[0, 0] >= self.LEAST_FIT
+                self.settings.association == GIVEN or overlap(corners[None], box.corners[None])[0, 0] >= self.LEAST_FIT
             )
             if fits and self._assignments.give(k, n, candidate.quadric):
                 candidate.misfits = 0

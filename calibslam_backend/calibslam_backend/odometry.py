@@ -28,7 +28,7 @@ from calibslam_msgs_py.settings import setting
 class MotionNoise(FailureSettings):
     """Standard deviations of a motion whose covariance is unknown: sqrt(floor^2 + (share * motion)^2), and those of
     the drift that all such motions share. Both are of errors that are independent of each other at the scene,
-    `scene_depth` in front of the camera on its optical axis."""
+    `scene_depth` in front of the camera on its optical axis. (`FailureSettings` say which motions are none.)"""
 
     rotation_floor: float = setting(0.003, "unknown odometry noise: rotation at rest", unit="rad", low=1e-6)
     rotation_share: float = setting(0.05, "unknown odometry noise: share of the rotation", low=0.0, high=1.0)
@@ -139,7 +139,7 @@ class MotionChain:
         self._poses: list[gtsam.Pose3] = []  # camera in the chain's own frame, at those times
         self._measured: list[gtsam.Pose3] = []  # the same, nothing bridged
         self._covariances: list[Array | None] = []  # of the step that ends there
-        self._unseen: list[Array] = []  # (2,) what the body may have done unseen in that step [rad, m]
+        self._unseen: list[Array] = []  # (6,) what the body may have done unseen in that step [rad, m]
         self._failures = FailureFilter(noise, is_visual=noise.scene_depth > 0.0)
 
     @property
@@ -171,7 +171,7 @@ class MotionChain:
             to_camera = self._extrinsic.inverse().AdjointMap()
             covariance = to_camera @ covariance @ to_camera.T
         if not self._times:
-            self._append(motion.start, gtsam.Pose3(), gtsam.Pose3(), None, np.zeros(2))
+            self._append(motion.start, gtsam.Pose3(), gtsam.Pose3(), None, np.zeros(6))
         last = self._times[-1]
         if motion.start < last:
             raise InvalidMeasurement(
@@ -182,7 +182,7 @@ class MotionChain:
         if motion.start > last:
             problem = "odometry_gap"
             gap = (motion.start - last) / SECOND
-            unseen = np.full(2, self.UNSEEN_MOTION * gap)
+            unseen = np.full(6, self.UNSEEN_MOTION * gap)
             self._append(motion.start, gtsam.Pose3(), gtsam.Pose3(), np.zeros((6, 6)), unseen)
             self._failures.unseen(gap)
         seconds = (motion.end - motion.start) / SECOND
@@ -215,7 +215,7 @@ class MotionChain:
         """`motion` and its covariance (6, 6) [rotation, translation]."""
         first, last = self._pose_at(start, self._poses), self._pose_at(end, self._poses)
         motion = first.between(last)
-        covariance, unseen, unknown = np.zeros((6, 6)), np.zeros(2), False
+        covariance, unseen, unknown = np.zeros((6, 6)), np.zeros(6), False
         for i in range(bisect_right(self._times, start), len(self._times)):
             begin, finish = max(start, self._times[i - 1]), min(end, self._times[i])
             if begin >= end:
@@ -230,7 +230,7 @@ class MotionChain:
                 covariance += to_end @ (share * known) @ to_end.T
         if unknown:
             covariance = self._noise.covariance(motion.matrix())
-        return motion.matrix(), covariance + np.diag(np.repeat(unseen**2, 3))
+        return motion.matrix(), covariance + np.diag(unseen**2)
 
     def forget_before(self, time: int) -> None:
         """Drop what is not needed to read times from `time` [ns] on."""

@@ -6,21 +6,24 @@ exceeds lets most of it through, and in a row of wrong steps one agrees with ano
 how much this odometry usually errs are both taken into account, step by step.
 
 The velocity v of the body is a random walk. A step measures it with noise of the variance R that is usual for this
-odometry, or it fails, and tells nothing: then it says v plus an error of a variance B besides. Failing goes on, as a
-Markov chain of two states. Given v ~ N(m, P) before, and q P's growth, a step z has failed with the probability p,
+odometry, or it fails, and tells nothing: then it says v with an error that is broader, of the variance R + B. Failing
+goes on, as a Markov chain of two states. Given v ~ N(m, P) before, grown by what it may have changed since, a step z
+has failed with the probability p,
 
-    p / (1 - p) = prior * N(z - m; P + q + R + B) / N(z - m; P + q + R),
+    p / (1 - p) = prior / (1 - prior) * N(z; m, P + R + B) / N(z; m, P + R),
 
 and v is afterwards the mixture of what it would be in either case, of which mean and variance are kept (the generalised
-pseudo-Bayesian filter of first order; Ackerson and Fu 1970). The motion of the step is that mixture as well: as measured
-if it did not fail, going on as before if it did, and in doubt both, with what they differ by as uncertainty.
+pseudo-Bayesian filter of first order; Ackerson and Fu 1970). The motion of the step is that mixture as well: as
+measured if it did not fail, going on as before if it did, in doubt both, with what they differ by as uncertainty.
 
 R is read off the steps themselves: half the median squared difference of consecutive ones, which failures do not
-move as long as they are fewer than the others. Rotation and translation have variances of their own, each for one axis.
+move as long as they are fewer than the others, one for rotation and one for translation; or it is what the step states,
+if that is more. B is `failure_error` squared and nine times R, so failures are broader than any noise.
 """
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from dataclasses import dataclass
 
@@ -53,7 +56,7 @@ class BelievedStep:
 
     Attributes:
         velocity: (6,) [rad/s, m/s].
-        variance: (2,) of it for each axis of rotation and of translation, beyond the noise of a good step.
+        variance: (6,) of it, beyond the noise of a good step.
         failed: probability that odometry failed.
     """
 
@@ -70,10 +73,12 @@ class FailureFilter:
     FIRST_NOISE = 0.3  # [rad/s, m/s]
     LEAST_NOISE = 0.05  # [rad/s, m/s]
     OPEN = 1e6  # variance that says: not measured
+    NEW_MOTION = 5  # steps in a row that agree with each other are no failures, whatever the body did before
     SURE = 0.01  # probability of a failure below which a step is taken as it is
     # Visual odometry that finds nothing often says that nothing moved. Of a body that does move that is no measurement,
     # unless it goes on so long that it must have stopped.
     STILL, MOVING, STOPPED = 1e-9, 0.02, 1.0  # [rad/s, m/s], [rad/s, m/s], [s]
+    BROADER = 3.0  # times the usual noise, besides `failure_error`
     MEDIAN = 2.366 / 3.0  # of chi-squared with three degrees of freedom, per degree
 
     def __init__(self, settings: FailureSettings, is_visual: bool = True) -> None:
@@ -81,10 +86,11 @@ class FailureFilter:
         self._settings = settings
         self._is_visual = is_visual
         self._changes: deque[Array] = deque(maxlen=self.REMEMBERED)
-        self._noise = np.full(2, self.FIRST_NOISE**2)
+        self._noise = np.full(6, self.FIRST_NOISE**2)
         self._failed = self._still = 0.0
+        self._agreeing = 0
         self._last: Array | None = None  # as measured
-        self._velocity, self._variance = np.zeros(6), np.full(2, settings.agility**2)
+        self._velocity, self._variance = np.zeros(6), np.full(6, settings.agility**2)
 
     def unseen(self, seconds: float) -> None:
         """So long nothing was measured."""
@@ -101,31 +107,28 @@ class FailureFilter:
         s = self._settings
         self.unseen(seconds)
         before, P = self._velocity, self._variance
-        if self._says_nothing(velocity, seconds, covariance) or np.linalg.norm(velocity[3:]) > s.max_speed:
+        if self._says_nothing(velocity, seconds, covariance) or math.hypot(*velocity[3:]) > s.max_speed:
             self._failed = 1.0
             return BelievedStep(before, P, 1.0)
-        is_first = self._last is None
-        self._learn_noise(velocity)
+        last, self._last = self._last, velocity
+        if last is not None:
+            self._learn_noise(velocity, last)
         R = self._noise
         if covariance is not None:
-            stated = np.array([covariance[:3, :3].trace(), covariance[3:, 3:].trace()]) / (3.0 * seconds**2)
-            R = np.clip(stated, R, self.OPEN)
-        if is_first:
-            self._velocity, self._variance = velocity, R
-            return BelievedStep(velocity, np.zeros(2), 0.0)
-        good, bad = P + R, P + R + s.failure_error**2
+            R = np.maximum(R, np.minimum(np.diag(covariance), self.OPEN * seconds**2) / seconds**2)
+        if last is None or self._is_new_motion(velocity - last, R, seconds):
+            self._velocity, self._variance, self._failed = velocity, R, 0.0
+            return BelievedStep(velocity, np.zeros(6), 0.0)
         innovation = velocity - before
-        squared = _mean_squares(innovation)
-        evidence = 1.5 * np.sum(squared * (1.0 / good - 1.0 / bad) - np.log(bad / good))
         prior = self._failed * (1.0 - s.failure_ends) + (1.0 - self._failed) * s.failure_begins
-        p = self._failed = _probability(evidence, prior)
+        p = self._failed = _probability(self._evidence(innovation, P + R, R), prior)
         # The mixture of an update with gain K and of none.
-        K = P / good
-        self._velocity = before + np.repeat((1.0 - p) * K, 3) * innovation
-        self._variance = (1.0 - p) * (1.0 - K) * P + p * P + p * (1.0 - p) * K**2 * squared
+        K = P / (P + R)
+        self._velocity = before + (1.0 - p) * K * innovation
+        self._variance = (1.0 - p) * (1.0 - K) * P + p * P + p * (1.0 - p) * (K * innovation) ** 2
         if p < self.SURE:
-            return BelievedStep(velocity, np.zeros(2), p)
-        return BelievedStep((1.0 - p) * velocity + p * before, p * P + p * (1.0 - p) * squared, p)
+            return BelievedStep(velocity, np.zeros(6), p)
+        return BelievedStep((1.0 - p) * velocity + p * before, p * P + p * (1.0 - p) * innovation**2, p)
 
     def _says_nothing(self, velocity: Array, seconds: float, covariance: Array | None) -> bool:
         """Whether it says that a moving body does not move."""
@@ -135,19 +138,26 @@ class FailureFilter:
         self._still += seconds
         return self._still < self.STOPPED and bool(np.abs(self._velocity).max() > self.MOVING)
 
-    def _learn_noise(self, velocity: Array) -> None:
-        last, self._last = self._last, velocity
-        if last is None or np.abs(velocity).max() <= self.STILL:
+    def _is_new_motion(self, change: Array, R: Array, seconds: float) -> bool:
+        """Whether steps that failed all say the same; `change` (6,) from the last one to this."""
+        alike = self._evidence(change, 2.0 * R + self._settings.agility**2 * seconds, R) < 0.0
+        self._agreeing = self._agreeing + 1 if self._failed > 0.5 and alike else 0
+        return self._agreeing >= self.NEW_MOTION
+
+    def _evidence(self, difference: Array, variance: Array, R: Array) -> float:
+        """Logarithm of how much likelier a difference (6,) of velocities is if the step failed than if it did not and
+        the difference has this variance (6,)."""
+        failed = variance + self._settings.failure_error**2 + self.BROADER**2 * R
+        return 0.5 * float(np.sum(difference**2 * (1.0 / variance - 1.0 / failed) - np.log(failed / variance)))
+
+    def _learn_noise(self, velocity: Array, last: Array) -> None:
+        if np.abs(velocity).max() <= self.STILL:
             return
-        self._changes.append(_mean_squares(velocity - last))
+        change = velocity - last
+        self._changes.append(np.array([change[:3] @ change[:3], change[3:] @ change[3:]]) / 3.0)
         if len(self._changes) >= self.LEAST:
             usual = np.median(np.array(self._changes), axis=0) / self.MEDIAN / 2.0
-            self._noise = np.maximum(usual, self.LEAST_NOISE**2)
-
-
-def _mean_squares(velocity: Array) -> Array:
-    """(2,) of rotation and translation, per axis."""
-    return np.array([velocity[:3] @ velocity[:3], velocity[3:] @ velocity[3:]]) / 3.0
+            self._noise = np.repeat(np.maximum(usual, self.LEAST_NOISE**2), 3)
 
 
 def _probability(evidence: float, prior: float) -> float:

@@ -6,16 +6,18 @@ import json
 from itertools import pairwise
 from pathlib import Path
 
+import gtsam
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
 from calibslam_backend.object_map import ObjectMap
-from calibslam_msgs_py.measurements import Array, Boxes, Camera, QuadricEstimate
+from calibslam_msgs_py.measurements import SECOND, Array, Boxes, Camera, QuadricEstimate, RelativeMotion
 from calibslam_sim import experiment
 from calibslam_sim.experiments import quadric_sim, tum
 from calibslam_sim.experiments.design import ExperimentError, repetition_seed
 from calibslam_sim.experiments.object_slam import estimate
+from calibslam_sim.failing_odometry import OdometryFailures
 from calibslam_sim.simulation import Simulation, SimulationSettings, simulate
 
 QUICK = quadric_sim.QuadricSimSettings(duration=8.0)
@@ -135,6 +137,52 @@ def test_tum_gives_few_conditions_a_third_of_the_images(folder: Path, monkeypatc
     count = len(tum.recorded(settings).images)
     assert len(few) < 0.5 * count < 0.8 * count < len(usual) < count
     assert same == few  # conditions are compared on the same images
+
+
+def test_tum_gives_failing_conditions_the_same_failures(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    settings = tum.TumSettings(folder=str(folder))
+    given: list[list[np.ndarray]] = []
+
+    class Seen(Exception):
+        pass
+
+    def seeing(camera: Camera, motions: list[RelativeMotion], images: list[Boxes], back_end: object) -> ObjectMap:
+        given.append([motion.T_start_end for motion in motions])
+        raise Seen
+
+    monkeypatch.setattr(tum, "estimate", seeing)
+    monkeypatch.setattr(tum, "OdometryFailures", lambda: OdometryFailures(every=1.0))
+    for name in ("real_given_fixed", "failing_given_fixed", "failing_estimated_calibrated"):
+        with pytest.raises(Seen):
+            tum.run(settings, name, 3)
+    usual, failing, same = given
+    np.testing.assert_array_equal(failing, same)
+    changed = [not np.array_equal(a, b) for a, b in zip(usual, failing, strict=True)]
+    assert 0.1 < np.mean(changed) < 0.95
+
+
+def test_failures_of_odometry() -> None:
+    """Ten minutes at 30 Hz: how often, for how long, and what is said; times of the steps stay, and the seed decides."""
+    step = SECOND // 30
+    T = gtsam.Pose3(gtsam.Rot3(), np.array([0.01, 0.0, 0.0])).matrix()
+    motions = [RelativeMotion(k * step, (k + 1) * step, T) for k in range(18_000)]
+    failures = OdometryFailures()
+    spoilt = failures.spoil(motions, np.random.default_rng(0))
+    assert [(m.start, m.end) for m in spoilt] == [(m.start, m.end) for m in motions]
+    wrong = np.array([m is not motion for m, motion in zip(spoilt, motions, strict=True)])
+    begins, ends = np.flatnonzero(np.diff(wrong.astype(int)) == 1), np.flatnonzero(np.diff(wrong.astype(int)) == -1)
+    lengths = (ends - begins) / 30.0
+    assert 0.36 < lengths.min() < 0.5 and 0.9 < lengths.max() < 1.04
+    assert 30 <= len(begins) <= 60 and np.diff(begins).min() >= 295  # 15 s give or take 5
+    said = np.stack([m.T_start_end for m, w in zip(spoilt, wrong, strict=True) if w])
+    still = (said == np.eye(4)).all(axis=(1, 2))
+    assert abs(still.mean() - failures.nothing) < 4.0 * np.sqrt(0.2 * 0.8 / len(said))
+    error = (said[~still, :3, 3] - T[:3, 3]) * 30.0  # [m/s]
+    expected = np.sqrt((0.3 * 0.25**2 + 0.5) / 0.8) * failures.velocity
+    assert np.sqrt((error[:, 1:] ** 2).mean()) == pytest.approx(expected, rel=0.1)
+    again = failures.spoil(motions, np.random.default_rng(0))
+    assert all(np.array_equal(a.T_start_end, b.T_start_end) for a, b in zip(spoilt, again, strict=True))
+    assert failures.spoil([], np.random.default_rng(0)) == []
 
 
 def test_tum_command(folder: Path, tmp_path: Path) -> None:

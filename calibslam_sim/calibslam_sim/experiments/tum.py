@@ -9,6 +9,8 @@ Families of conditions:
         errors of its odometry are the same; what is known when, and so which objects begin and who takes which box,
         is not. What hangs on the order of things shows here.
     few_given_..., few_estimated_...: every third image only, drawn at random, as a detector a third as fast would give.
+    failing_given_..., failing_estimated_...: the odometry fails about every 15 s besides, for up to a second: it says
+        anything, or that nothing moved (`failing_odometry`).
 Two more, real_given_underconfident and real_given_scale_4, believe calibrated deviations to be 2 and 4 times as large:
 if errors are alike from image to image, what is right for each box is too confident for a row of them.
 With real odometry each repetition leaves out another tenth of the images (`few_`: two thirds): their spread tells how
@@ -49,6 +51,7 @@ from calibslam_sim.experiments.design import (
 )
 from calibslam_sim.experiments.figures import condition_figure
 from calibslam_sim.experiments.object_slam import accuracy_of_trajectory, estimate
+from calibslam_sim.failing_odometry import OdometryFailures
 from calibslam_sim.odometry_noise import OdometryNoise
 from calibslam_sim.tum_folder import TumError, read_camera, read_detections, read_trajectory
 
@@ -62,7 +65,7 @@ NOISE = {
     UNDERCONFIDENT: (OWN_COVARIANCE, 2.0),
     scale_name(4.0): (OWN_COVARIANCE, 4.0),
 }
-REAL_GIVEN, BACKWARDS, FEW = "real_given_", "backwards_", "few_"
+REAL_GIVEN, BACKWARDS, FEW, FAILING = "real_given_", "backwards_", "few_", "failing_"
 # Prefix of a condition -> association.
 REAL = {
     REAL_GIVEN: GIVEN,
@@ -71,6 +74,8 @@ REAL = {
     BACKWARDS + "estimated_": ESTIMATED,
     FEW + "given_": GIVEN,
     FEW + "estimated_": ESTIMATED,
+    FAILING + "given_": GIVEN,
+    FAILING + "estimated_": ESTIMATED,
 }
 GROUND_TRUTH, ODOMETRY, DETECTIONS, CAMERA_INFO = (
     "groundtruth.txt",
@@ -137,6 +142,8 @@ def run(settings: TumSettings, condition: str, seed: Seed) -> Metrics:
         left_out = settings.left_out_of_few if family.startswith(FEW) else settings.left_out
         kept = rng.random(len(images)) >= left_out
         images = [boxes for boxes, keep in zip(images, kept, strict=True) if keep]
+        if family.startswith(FAILING):
+            motions = OdometryFailures().spoil(motions, rng)
     else:
         noise = OdometryNoise(np.radians(settings.rotation_noise), settings.translation_noise)
         motions = [
