@@ -162,7 +162,7 @@ def test_tum_gives_failing_conditions_the_same_failures(folder: Path, monkeypatc
 
 
 def test_failures_of_odometry() -> None:
-    """Ten minutes at 30 Hz: how often, for how long, and what is said; times of the steps stay, and the seed decides."""
+    """Ten minutes at 30 Hz: how often, for how long, and what is said; times of steps stay, and the seed decides."""
     step = SECOND // 30
     T = gtsam.Pose3(gtsam.Rot3(), np.array([0.01, 0.0, 0.0])).matrix()
     motions = [RelativeMotion(k * step, (k + 1) * step, T) for k in range(18_000)]
