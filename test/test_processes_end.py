@@ -59,7 +59,7 @@ def test_signals_that_come_at_once(name: str) -> None:
     [
         ("odometry", "sead:=3", "unknown parameter sead; valid are: rotation_noise, seed, source"),
         ("calibrator", "kalibrator:=x", "unknown parameter kalibrator; valid are: calibrator"),
-        ("backend", "noise_modell:=fixed", "unknown parameter noise_modell; valid are: ambiguity, association"),
+        ("backend", "noise_modell:=fixed", "unknown parameter noise_modell; valid are: agility, ambiguity"),
         ("odometry", "source:=gps", "must be one of odom, ground_truth"),
         ("calibrator", "calibrator:=/nowhere.json", "calibrator file /nowhere.json cannot be read"),
         ("backend", "noise_model:=best", "must be one of calibrated, fixed, quadricslam"),
