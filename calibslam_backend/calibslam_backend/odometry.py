@@ -182,15 +182,19 @@ class MotionChain:
         if motion.start > last:
             problem = "odometry_gap"
             gap = (motion.start - last) / SECOND
-            unseen = np.full(6, self.UNSEEN_MOTION * gap)
-            self._append(motion.start, gtsam.Pose3(), gtsam.Pose3(), np.zeros((6, 6)), unseen)
+            moved = np.full(6, self.UNSEEN_MOTION * gap)
+            self._append(motion.start, gtsam.Pose3(), gtsam.Pose3(), np.zeros((6, 6)), moved)
             self._failures.unseen(gap)
         seconds = (motion.end - motion.start) / SECOND
         measured = self._extrinsic.inverse() * gtsam.Pose3(motion.T_start_end) * self._extrinsic
         believed = self._failures.believe(gtsam.Pose3.Logmap(measured) / seconds, seconds, covariance)
         step = gtsam.Pose3.Expmap(believed.velocity * seconds) if believed.variance.any() else measured
-        closed = None if covariance is None else self._closed(covariance, seconds)
-        self._append(motion.end, step, measured, closed, np.sqrt(believed.variance) * seconds)
+        closed, unseen = None, np.sqrt(believed.variance)
+        if covariance is not None:
+            closed = self._closed(covariance, seconds)
+            is_open = np.diag(covariance) > self.OPEN**2
+            unseen = np.where(is_open, np.minimum(unseen, self.UNSEEN_MOTION), unseen)
+        self._append(motion.end, step, measured, closed, unseen * seconds)
         return "odometry_implausible" if believed.failed > 0.5 else problem
 
     def _closed(self, covariance: Array, seconds: float) -> Array:
@@ -221,7 +225,7 @@ class MotionChain:
             if begin >= end:
                 break
             share = (finish - begin) / (self._times[i] - self._times[i - 1])
-            unseen = unseen + share * self._unseen[i]  # of one wrong velocity, hence not in squares
+            unseen += share * self._unseen[i]  # of one wrong velocity, hence not in squares
             known = self._covariances[i]
             if known is None:
                 unknown = True

@@ -237,6 +237,16 @@ def test_what_a_stated_covariance_explains_is_no_failure() -> None:
         assert chain.add(moved(1, 1.5, np.eye(6) * sigma**2)) == expected
 
 
+def test_a_failure_does_not_open_directions_that_are_left_open() -> None:
+    """A robot in a plane states 1e6 of height; where its odometry fails, height is as unsure as in a gap, no more."""
+    covariance = np.diag([1e-4] * 5 + [1e6])
+    chain = MotionChain(MotionNoise(), np.eye(4))
+    said = [chain.add(moved(k, x, covariance)) for k, x in enumerate((0.1, 1.5, 0.1))]
+    assert said == ["", "odometry_implausible", ""]
+    found = chain.between(T0 + STEP, T0 + 2 * STEP)[1]
+    assert found[5, 5] == pytest.approx(2.0 * 0.1**2)  # 1 m/s for 0.1 s, once for what is open and once for the failure
+
+
 def test_after_a_long_gap_any_velocity_is_believed() -> None:
     """Velocities may have changed by 3 m/s in 9 s."""
     chain = MotionChain(MotionNoise(), np.eye(4))
