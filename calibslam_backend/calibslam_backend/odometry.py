@@ -126,11 +126,11 @@ class MotionChain:
     Where odometry fails the body is taken to go on as it did, and to do unseen what it may, see `odometry_failures`.
     """
 
-    # What a body may do unseen, while odometry is missing: 1 rad/s and 1 m/s more or less.
+    # What a body may do unseen, while odometry is missing or where it leaves a direction open: 1 rad/s and 1 m/s.
     UNSEEN_MOTION = 1.0
     # A standard deviation [rad, m] of one step that says: not measured.
     OPEN = 1.0
-    SHORTEST = 0.03  # [s] in which a body does what it does unseen, where a direction is left open
+    SHORTEST = 0.03  # [s]: a shorter step leaves no less open
 
     def __init__(self, noise: MotionNoise, T_body_camera: Array) -> None:
         self._noise = noise

@@ -71,8 +71,7 @@ class FailureFilter:
     REMEMBERED = 30  # steps of which the usual noise is read off
     LEAST = 10  # before there are so many, it is taken to be
     FIRST_NOISE = 0.3  # [rad/s, m/s]
-    LEAST_NOISE = 0.05  # [rad/s, m/s]
-    OPEN = 1e6  # variance that says: not measured
+    LEAST_NOISE, LARGEST_NOISE = 0.05, 1e3  # [rad/s, m/s]; more is stated of what is not measured
     NEW_MOTION = 5  # steps in a row that agree with each other are no failures, whatever the body did before
     SURE = 0.01  # probability of a failure below which a step is taken as it is
     # Visual odometry that finds nothing often says that nothing moved. Of a body that does move that is no measurement,
@@ -115,7 +114,7 @@ class FailureFilter:
             self._learn_noise(velocity, last)
         R = self._noise
         if covariance is not None:
-            R = np.maximum(R, np.minimum(np.diag(covariance), self.OPEN * seconds**2) / seconds**2)
+            R = np.maximum(R, np.minimum(np.diag(covariance), (self.LARGEST_NOISE * seconds) ** 2) / seconds**2)
         if last is None or self._is_new_motion(velocity - last, R, seconds):
             self._velocity, self._variance, self._failed = velocity, R, 0.0
             return BelievedStep(velocity, np.zeros(6), 0.0)

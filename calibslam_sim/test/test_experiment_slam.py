@@ -118,22 +118,32 @@ def test_tum_backwards_undoes_every_motion(folder: Path) -> None:
     np.testing.assert_allclose(again.odometry[5].T_start_end, forwards.odometry[5].T_start_end, atol=1e-12)
 
 
-def test_tum_gives_few_conditions_a_third_of_the_images(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    settings = tum.TumSettings(folder=str(folder))
-    given: list[list[int]] = []  # stamps of the images of each run
+def reaching_the_back_end(
+    settings: tum.TumSettings, conditions: tuple[str, ...], monkeypatch: pytest.MonkeyPatch
+) -> list[tuple[list[RelativeMotion], list[Boxes]]]:
+    """Motions and images that each condition gives to the back end, which is not run; the same seed for all."""
+    given: list[tuple[list[RelativeMotion], list[Boxes]]] = []
 
-    class Counted(Exception):
+    class Seen(Exception):
         pass
 
-    def counting(camera: Camera, motions: object, images: list[Boxes], back_end: object) -> ObjectMap:
-        given.append([boxes.stamp for boxes in images])
-        raise Counted
+    def seeing(camera: Camera, motions: list[RelativeMotion], images: list[Boxes], back_end: object) -> ObjectMap:
+        given.append((motions, images))
+        raise Seen
 
-    monkeypatch.setattr(tum, "estimate", counting)
-    for name in ("real_given_fixed", "few_given_fixed", "few_given_calibrated"):
-        with pytest.raises(Counted):
+    monkeypatch.setattr(tum, "estimate", seeing)
+    for name in conditions:
+        with pytest.raises(Seen):
             tum.run(settings, name, 3)
-    usual, few, same = given
+    return given
+
+
+def test_tum_gives_few_conditions_a_third_of_the_images(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    settings = tum.TumSettings(folder=str(folder))
+    given = reaching_the_back_end(
+        settings, ("real_given_fixed", "few_given_fixed", "few_given_calibrated"), monkeypatch
+    )
+    usual, few, same = ([boxes.stamp for boxes in images] for _, images in given)
     count = len(tum.recorded(settings).images)
     assert len(few) < 0.5 * count < 0.8 * count < len(usual) < count
     assert same == few  # conditions are compared on the same images
@@ -141,21 +151,11 @@ def test_tum_gives_few_conditions_a_third_of_the_images(folder: Path, monkeypatc
 
 def test_tum_gives_failing_conditions_the_same_failures(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     settings = tum.TumSettings(folder=str(folder))
-    given: list[list[np.ndarray]] = []
-
-    class Seen(Exception):
-        pass
-
-    def seeing(camera: Camera, motions: list[RelativeMotion], images: list[Boxes], back_end: object) -> ObjectMap:
-        given.append([motion.T_start_end for motion in motions])
-        raise Seen
-
-    monkeypatch.setattr(tum, "estimate", seeing)
     monkeypatch.setattr(tum, "OdometryFailures", lambda: OdometryFailures(every=1.0))
-    for name in ("real_given_fixed", "failing_given_fixed", "failing_estimated_calibrated"):
-        with pytest.raises(Seen):
-            tum.run(settings, name, 3)
-    usual, failing, same = given
+    given = reaching_the_back_end(
+        settings, ("real_given_fixed", "failing_given_fixed", "failing_estimated_calibrated"), monkeypatch
+    )
+    usual, failing, same = ([motion.T_start_end for motion in motions] for motions, _ in given)
     np.testing.assert_array_equal(failing, same)
     changed = [not np.array_equal(a, b) for a, b in zip(usual, failing, strict=True)]
     assert 0.1 < np.mean(changed) < 0.95
