@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from calibslam_backend.association import AssociationSettings
 from calibslam_backend.graph import GraphSettings
 from calibslam_backend.initialisation import InitialisationSettings
+from calibslam_backend.motion_noise import MotionNoise
 from calibslam_backend.noise import NoiseSettings
-from calibslam_backend.odometry import MotionNoise
 from calibslam_backend.relocalisation import RelocalisationSettings
 from calibslam_backend.tracking import TrackingSettings
 from calibslam_msgs_py.settings import Settings, setting

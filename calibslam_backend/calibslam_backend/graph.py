@@ -22,7 +22,8 @@ from calibslam_backend.box_correlation import LAGS, BoxCorrelation
 from calibslam_backend.box_factor import box_factor, box_tangents, pose_information
 from calibslam_backend.box_measurement import BoxMeasurement
 from calibslam_backend.initialisation import InitialisationSettings
-from calibslam_backend.odometry import MotionNoise, dead_reckoning
+from calibslam_backend.motion_noise import MotionNoise
+from calibslam_backend.odometry import dead_reckoning
 from calibslam_backend.odometry_factor import DRIFT, motion_factor
 from calibslam_backend.quadric import matrix_from_vector
 from calibslam_backend.smoother import Smoother

@@ -1,63 +1,18 @@
-"""Relative motions from odometry, and what is believed of them.
-
-Odometry covariances are often missing. `MotionNoise` then stands in: a share of the motion itself plus a floor,
-which is what frame-to-frame visual odometry was seen to do on recordings of slow and fast motion alike, and a
-constant part, which the graph estimates (see `odometry_factor`).
-
-A camera that turns a little to the right sees nearly what one sees that moves a little to the right. Visual odometry
-hardly tells the two apart, and takes a part of one for the other; what it sees stays where it is in the image. So it
-knows well how the scene moves before the camera, and its errors of rotation turn the camera about the scene. On real
-recordings its errors of sideways translation and of rotation correlate by 0.73 to 0.96 (docs/method.md).
-"""
+"""Relative motions from odometry: differences of its poses, and the chain of them that can be read at any time."""
 
 from __future__ import annotations
 
 from bisect import bisect_right
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from itertools import pairwise
 
 import gtsam
 import numpy as np
 
-from calibslam_backend.odometry_failures import FailureFilter, FailureSettings
+from calibslam_backend.motion_noise import MotionNoise
+from calibslam_backend.odometry_failures import FailureFilter
 from calibslam_msgs_py.measurements import SECOND, Array, InvalidMeasurement, RelativeMotion
-from calibslam_msgs_py.settings import setting
-
-
-@dataclass(frozen=True)
-class MotionNoise(FailureSettings):
-    """Standard deviations of a motion whose covariance is unknown: sqrt(floor^2 + (share * motion)^2), and those of
-    the drift that all such motions share. Both are of errors that are independent of each other at the scene,
-    `scene_depth` in front of the camera on its optical axis. (`FailureSettings` say which motions are none.)"""
-
-    rotation_floor: float = setting(0.003, "unknown odometry noise: rotation at rest", unit="rad", low=1e-6)
-    rotation_share: float = setting(0.05, "unknown odometry noise: share of the rotation", low=0.0, high=1.0)
-    translation_floor: float = setting(0.003, "unknown odometry noise: translation at rest", unit="m", low=1e-6)
-    translation_share: float = setting(0.02, "unknown odometry noise: share of the translation", low=0.0, high=1.0)
-    scene_depth: float = setting(
-        1.0, "unknown odometry noise: how far away is what it sees; 0 if it is not visual", unit="m", low=0.0
-    )
-    drift_rotation: float = setting(0.003, "unknown odometry noise: constant drift in rotation", unit="rad/s", low=1e-9)
-    drift_translation: float = setting(
-        0.003, "unknown odometry noise: constant drift in translation", unit="m/s", low=1e-9
-    )
-
-    def covariance(self, T_start_end: Array) -> Array:
-        """(6, 6) [rotation, translation] for a motion (4, 4) of the camera, at its end."""
-        motion = gtsam.Pose3.Logmap(gtsam.Pose3(T_start_end))
-        rotation = np.hypot(self.rotation_floor, self.rotation_share * np.linalg.norm(motion[:3]))
-        translation = np.hypot(self.translation_floor, self.translation_share * np.linalg.norm(motion[3:]))
-        return self._about_scene(np.repeat([rotation, translation], 3))
-
-    def drift_covariance(self) -> Array:
-        """(6, 6) of the constant drift [rad/s, m/s]."""
-        return self._about_scene(np.repeat([self.drift_rotation, self.drift_translation], 3))
-
-    def _about_scene(self, deviations: Array) -> Array:
-        """(6, 6) in the camera, of errors that are independent, with deviations (6,), in a frame at the scene."""
-        T_camera_scene = gtsam.Pose3(gtsam.Rot3(), np.array([0.0, 0.0, self.scene_depth]))
-        square_root = T_camera_scene.AdjointMap() * deviations
-        return np.asarray(square_root @ square_root.T)
 
 
 class OdometryDifferencer:
@@ -118,6 +73,27 @@ def dead_reckoning(start: Array, covariance: Array, steps: Iterable[tuple[Array,
     return np.stack([pose.matrix() for pose in poses]), np.stack(covariances)
 
 
+@dataclass(frozen=True)
+class _Step:
+    """One motion of a chain.
+
+    Attributes:
+        end: time [ns]; it starts where the one before ends.
+        pose: of the camera at its end, in the chain's own frame.
+        measured: the same, nothing bridged.
+        covariance: (6, 6) of the motion, in the camera at its end.
+        unseen: (6,) what the body may have done unseen besides [rad, m].
+        drifts: whether it does.
+    """
+
+    end: int
+    pose: gtsam.Pose3
+    measured: gtsam.Pose3
+    covariance: Array
+    unseen: Array
+    drifts: bool
+
+
 class MotionChain:
     """Consecutive relative motions of the camera, readable between any two times.
 
@@ -135,22 +111,18 @@ class MotionChain:
     def __init__(self, noise: MotionNoise, T_body_camera: Array) -> None:
         self._noise = noise
         self._extrinsic = gtsam.Pose3(T_body_camera)
-        self._times: list[int] = []  # ends of steps; the first is the start of the chain
-        self._poses: list[gtsam.Pose3] = []  # camera in the chain's own frame, at those times
-        self._measured: list[gtsam.Pose3] = []  # the same, nothing bridged
-        self._covariances: list[Array | None] = []  # of the step that ends there
-        self._unseen: list[Array] = []  # (6,) what the body may have done unseen in that step [rad, m]
+        self._steps: list[_Step] = []  # the first, of no duration, is the start of the chain
         self._failures = FailureFilter(noise, is_visual=noise.scene_depth > 0.0)
 
     @property
     def start(self) -> int | None:
         """First time it knows [ns]."""
-        return self._times[0] if self._times else None
+        return self._steps[0].end if self._steps else None
 
     @property
     def end(self) -> int | None:
         """Last time it knows [ns]."""
-        return self._times[-1] if self._times else None
+        return self._steps[-1].end if self._steps else None
 
     def add(self, motion: RelativeMotion) -> str:
         """Append a motion of the body.
@@ -170,9 +142,10 @@ class MotionChain:
                 raise InvalidMeasurement("covariance", f"covariance at {motion.end} ns is not positive definite")
             to_camera = self._extrinsic.inverse().AdjointMap()
             covariance = to_camera @ covariance @ to_camera.T
-        if not self._times:
-            self._append(motion.start, gtsam.Pose3(), gtsam.Pose3(), None, np.zeros(6))
-        last = self._times[-1]
+        last = self.end
+        if last is None:
+            last = motion.start
+            self._stay(last, 0.0)
         if motion.start < last:
             raise InvalidMeasurement(
                 "overlap",
@@ -182,19 +155,30 @@ class MotionChain:
         if motion.start > last:
             problem = "odometry_gap"
             gap = (motion.start - last) / SECOND
-            moved = np.full(6, self.UNSEEN_MOTION * gap)
-            self._append(motion.start, gtsam.Pose3(), gtsam.Pose3(), np.zeros((6, 6)), moved)
+            self._stay(motion.start, self.UNSEEN_MOTION * gap)
             self._failures.unseen(gap)
         seconds = (motion.end - motion.start) / SECOND
         measured = self._extrinsic.inverse() * gtsam.Pose3(motion.T_start_end) * self._extrinsic
         believed = self._failures.believe(gtsam.Pose3.Logmap(measured) / seconds, seconds, covariance)
         step = gtsam.Pose3.Expmap(believed.velocity * seconds) if believed.variance.any() else measured
-        closed, unseen = None, np.sqrt(believed.variance)
-        if covariance is not None:
-            closed = self._closed(covariance, seconds)
+        unseen = np.sqrt(believed.variance)
+        if covariance is None:
+            noise = self._noise.covariance(gtsam.Pose3.Logmap(step), seconds)
+        else:
+            noise = self._closed(covariance, seconds)
             is_open = np.diag(covariance) > self.OPEN**2
             unseen = np.where(is_open, np.minimum(unseen, self.UNSEEN_MOTION), unseen)
-        self._append(motion.end, step, measured, closed, unseen * seconds)
+        before = self._steps[-1]
+        self._steps.append(
+            _Step(
+                motion.end,
+                before.pose * step,
+                before.measured * measured,
+                noise,
+                unseen * seconds,
+                drifts=covariance is None,
+            )
+        )
         return "odometry_implausible" if believed.failed > 0.5 else problem
 
     def _closed(self, covariance: Array, seconds: float) -> Array:
@@ -211,60 +195,54 @@ class MotionChain:
             (axes * np.where(variances > self.OPEN**2, np.minimum(variances, unseen), variances)) @ axes.T
         )
 
+    def _stay(self, time: int, unseen: float) -> None:
+        """Up to this time nothing is measured."""
+        pose, measured = (self._steps[-1].pose, self._steps[-1].measured) if self._steps else 2 * (gtsam.Pose3(),)
+        self._steps.append(_Step(time, pose, measured, np.zeros((6, 6)), np.full(6, unseen), drifts=False))
+
     def motion(self, start: int, end: int) -> Array:
         """(4, 4) of the camera from start to end [ns], which must lie inside the chain."""
-        return np.asarray(self._pose_at(start, self._poses).between(self._pose_at(end, self._poses)).matrix())
+        return np.asarray(self._pose_at(start).between(self._pose_at(end)).matrix())
 
     def between(self, start: int, end: int) -> tuple[Array, Array]:
         """`motion` and its covariance (6, 6) [rotation, translation]."""
-        first, last = self._pose_at(start, self._poses), self._pose_at(end, self._poses)
-        motion = first.between(last)
-        covariance, unseen, unknown = np.zeros((6, 6)), np.zeros(6), False
-        for i in range(bisect_right(self._times, start), len(self._times)):
-            begin, finish = max(start, self._times[i - 1]), min(end, self._times[i])
-            if begin >= end:
-                break
-            share = (finish - begin) / (self._times[i] - self._times[i - 1])
-            unseen += share * self._unseen[i]  # of one wrong velocity, hence not in squares
-            known = self._covariances[i]
-            if known is None:
-                unknown = True
-            else:
-                to_end = last.inverse().compose(self._pose_at(finish, self._poses)).AdjointMap()
-                covariance += to_end @ (share * known) @ to_end.T
-        if unknown:
-            covariance = self._noise.covariance(motion.matrix())
-        return motion.matrix(), covariance + np.diag(unseen**2)
-
-    def forget_before(self, time: int) -> None:
-        """Drop what is not needed to read times from `time` [ns] on."""
-        keep = max(bisect_right(self._times, time) - 1, 0)
-        del self._times[:keep], self._poses[:keep], self._measured[:keep]
-        del self._covariances[:keep], self._unseen[:keep]
+        first, last = self._pose_at(start), self._pose_at(end)
+        covariance, unseen = np.zeros((6, 6)), np.zeros(6)
+        for step, share, _ in self._inside(start, end):
+            unseen += share * step.unseen  # of one wrong velocity, hence not in squares
+            to_end = last.between(self._pose_at(min(end, step.end))).AdjointMap()
+            covariance += to_end @ (share * step.covariance) @ to_end.T
+        return np.asarray(first.between(last).matrix()), covariance + np.diag(unseen**2)
 
     def measured(self, start: int, end: int) -> Array:
         """Motion (4, 4) of the camera from start to end [ns] as odometry said, possible or not."""
-        return np.asarray(self._pose_at(start, self._measured).between(self._pose_at(end, self._measured)).matrix())
+        return np.asarray(self._pose_at(start, "measured").between(self._pose_at(end, "measured")).matrix())
 
     def drifts(self, start: int, end: int) -> float:
-        """How long [s] the motion from start to end [ns] drifts: all the time if its covariance is not known."""
-        steps = range(bisect_right(self._times, start), bisect_right(self._times, end - 1) + 1)
-        unknown = any(self._covariances[i] is None for i in steps if i < len(self._times))
-        return (end - start) / SECOND if unknown else 0.0
+        """How long [s] the motion from start to end [ns] drifts: in steps whose covariance is not known."""
+        return sum(seconds for step, _, seconds in self._inside(start, end) if step.drifts)
 
-    def _append(
-        self, time: int, step: gtsam.Pose3, measured: gtsam.Pose3, covariance: Array | None, unseen: Array
-    ) -> None:
-        self._times.append(time)
-        self._poses.append(self._poses[-1] * step if self._poses else step)
-        self._measured.append(self._measured[-1] * measured if self._measured else measured)
-        self._covariances.append(covariance)
-        self._unseen.append(unseen)
+    def forget_before(self, time: int) -> None:
+        """Drop what is not needed to read times from `time` [ns] on."""
+        del self._steps[: max(self._after(time) - 1, 0)]
 
-    def _pose_at(self, time: int, poses: list[gtsam.Pose3]) -> gtsam.Pose3:
-        i = bisect_right(self._times, time) - 1
-        if i == len(self._times) - 1:
-            return poses[i]
-        share = (time - self._times[i]) / (self._times[i + 1] - self._times[i])
-        step = gtsam.Pose3.Logmap(poses[i].between(poses[i + 1]))
-        return poses[i].compose(gtsam.Pose3.Expmap(share * step))
+    def _after(self, time: int) -> int:
+        """Which is the first step that ends after this time."""
+        return bisect_right(self._steps, time, key=lambda step: step.end)
+
+    def _inside(self, start: int, end: int) -> Iterator[tuple[_Step, float, float]]:
+        """The steps between two times [ns], the share of each that lies between them, and how long [s] that is."""
+        for before, step in pairwise(self._steps[max(self._after(start) - 1, 0) :]):
+            duration = min(end, step.end) - max(start, before.end)
+            if duration <= 0:
+                return
+            yield step, duration / (step.end - before.end), duration / SECOND
+
+    def _pose_at(self, time: int, which: str = "pose") -> gtsam.Pose3:
+        i = self._after(time) - 1
+        pose: gtsam.Pose3 = getattr(self._steps[i], which)
+        if i == len(self._steps) - 1:
+            return pose
+        before, after = self._steps[i : i + 2]
+        step = gtsam.Pose3.Logmap(pose.between(getattr(after, which)))
+        return pose.compose(gtsam.Pose3.Expmap((time - before.end) / (after.end - before.end) * step))

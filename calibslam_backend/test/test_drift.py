@@ -17,7 +17,6 @@ from calibslam_msgs_py.measurements import SECOND, Array, RelativeMotion
 
 WORLD = SmallWorld(around(240, turn=2.0 * np.pi), objects())
 SIGMAS = np.repeat([0.01, 0.02], 3)  # [rad/s, m/s] of drifts
-STEPS = 3  # of odometry between two keyframes
 RUNS = 4
 ALONG = 3  # the axis of a drift along the path: the camera moves sideways
 
@@ -36,9 +35,10 @@ def run(world: SmallWorld, drift: Array, sigmas: Array) -> Estimator:
     settings = EstimatorSettings(
         association=GIVEN,
         rotation_share=0.0,
-        rotation_floor=np.sqrt(STEPS) * world.rotation_sigma,
+        rotation_floor=world.rotation_sigma * np.sqrt(world.rate),
+        roll_share=1.0,
         translation_share=0.0,
-        translation_floor=np.sqrt(STEPS) * world.translation_sigma,
+        translation_floor=world.translation_sigma * np.sqrt(world.rate),
         drift_rotation=float(sigmas[0]),
         drift_translation=float(sigmas[3]),
         scene_depth=0.0,

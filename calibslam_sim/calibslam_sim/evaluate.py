@@ -17,8 +17,9 @@ from typing import Any
 import numpy as np
 
 from calibslam_backend.metrics import NoGroundTruth, Trajectory, alignment
+from calibslam_backend.motion_noise import MotionNoise
 from calibslam_backend.object_map import MapFileError, ObjectMap, tum_lines
-from calibslam_backend.odometry import MotionChain, MotionNoise, dead_reckoning
+from calibslam_backend.odometry import MotionChain, dead_reckoning
 from calibslam_backend.plots import plot_run
 from calibslam_backend.quadric import Ellipsoid
 from calibslam_backend.run_folder import accuracy

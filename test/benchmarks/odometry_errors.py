@@ -1,102 +1,181 @@
 """How visual odometry errs: what `MotionNoise` believes of motions without covariance, against ground truth.
 
-    ./calibslam shell -c 'python test/benchmarks/odometry_errors.py [FOLDER ...] [--images 10]'
+    ./calibslam shell -c 'python test/benchmarks/odometry_errors.py [FOLDER ...]'
 
 FOLDER is in TUM format, with odometry.txt and groundtruth.txt (default: both recordings of the shared data). For
-motions over some images: how errors about and along the camera's axes correlate, and the deviations and the depth of
-the scene under which they are likeliest (Student's t with 4 degrees of freedom, a constant drift for each recording).
+motions over 3, 6, 12 and 24 images: how large their errors at the scene are, and under which settings all of them are
+likeliest (Student's t with 4 degrees of freedom, whose standard deviation is printed; for each recording a constant
+drift; the truth itself has errors of its own, the same for short and long motions, which are fitted beside):
+
+    steps: the variance grows with each step, by floor^2 + (share * velocity)^2 in a second, as in `MotionNoise`;
+    whole: it is that of the whole motion, floor^2 + (share * motion)^2, however long it took.
 """
 
 from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
+from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
 
 import gtsam
 import numpy as np
 from live_graph import DATA
 from scipy.optimize import minimize
-from scipy.stats import multivariate_t
 
 from calibslam_backend.metrics import Trajectory, interpolated
-from calibslam_backend.odometry import MotionNoise
+from calibslam_backend.motion_noise import MotionNoise
 from calibslam_msgs_py.measurements import SECOND, Array
 from calibslam_sim.tum_folder import read_trajectory
 
-TAIL = 4  # degrees of freedom
+IMAGES = (3, 6, 12, 24)  # between the ends of a motion
+TAIL = 4.0  # degrees of freedom
+TO_DEVIATION = float(np.sqrt(TAIL / (TAIL - 2.0)))  # of the scale of that distribution
 DRIFT_UNIT = 0.01  # [rad/s, m/s], for the optimiser
-# What is fitted, as logarithms, where the search begins, and its bounds.
-FIELDS = ("rotation_floor", "rotation_share", "translation_floor", "translation_share", "scene_depth")
-BEGIN = np.log([0.003, 0.04, 0.003, 0.02, 1.0])
-BOUNDS = np.log([(2e-4, 0.02), (1e-3, 0.3), (2e-4, 0.02), (1e-3, 0.3), (0.1, 10.0)])
+# What is fitted, as logarithms, and where the search begins.
+DEVIATIONS = {
+    "rotation_floor": 0.003,
+    "rotation_share": 0.03,
+    "translation_floor": 0.003,
+    "translation_share": 0.013,
+    "truth_rotation": 0.001,  # [rad]
+    "truth_translation": 0.001,  # [m]
+}
+SHAPE = {"roll_share": 0.7, "scene_depth": 1.0}
+BEGIN = DEVIATIONS | SHAPE
+FARTHEST = 40.0  # times
 
 
+@dataclass(frozen=True)
 class Motions:
-    """Motions (N, 4, 4) of a recording by odometry, their errors (N, 6) [rad, m] and durations (N,) [s]."""
+    """Motions (N) of a recording over the same number K of images.
 
-    def __init__(self, folder: Path, images: int) -> None:
-        truth, odometry = (Trajectory.of(read_trajectory(folder / f"{x}.txt")) for x in ("groundtruth", "odometry"))
-        covered, true = interpolated(truth, odometry.stamps[::images])
-        stamps, measured = odometry.stamps[::images][covered], odometry.poses[::images][covered]
-        self.motions = np.stack([np.linalg.inv(a) @ b for a, b in pairwise(measured)])
-        true_motions = [np.linalg.inv(a) @ b for a, b in pairwise(true)]
-        self.errors = np.stack(
-            [
-                gtsam.Pose3.Logmap(gtsam.Pose3(np.linalg.inv(true_motion) @ motion))
-                for true_motion, motion in zip(true_motions, self.motions, strict=True)
-            ]
-        )
-        self.seconds = np.diff(stamps) / SECOND
+    Attributes:
+        errors: (N, 6) [rad, m] of odometry.
+        seconds: (N,) durations.
+        velocities: (N, K, 2) of each step, of rotation and of translation [rad/s, m/s].
+        durations: (N, K) of each step [s].
+        to_end: (N, K, 6, 6) adjoint maps from the camera after each step to that at the end.
+        lengths: (N, 2) rotation and translation of the whole motion [rad, m].
+    """
 
-    def log_likelihood(self, noise: MotionNoise, drift: Array) -> float:
-        """Of the errors beside a drift (6,) [rad/s, m/s]."""
+    errors: Array
+    seconds: Array
+    velocities: Array
+    durations: Array
+    to_end: Array
+    lengths: Array
+
+    def covariances(self, p: dict[str, float], by_steps: bool) -> Array:
+        """(N, 6, 6)."""
+        floors = np.array([p["rotation_floor"], p["translation_floor"]])
+        shares = np.array([p["rotation_share"], p["translation_share"]])
+        if by_steps:
+            to_end = self.to_end
+            variances = self.durations[:, :, None] * (floors**2 + (shares * self.velocities) ** 2)
+        else:
+            to_end = np.broadcast_to(np.eye(6), (len(self.errors), 1, 6, 6))
+            variances = (floors**2 + (shares * self.lengths) ** 2)[:, None]
+        ratios = np.array([1.0, 1.0, p["roll_share"] ** 2, 1.0, 1.0, 1.0])
+        at_scene = to_end @ about_scene(p["scene_depth"])
+        odometry = np.einsum("nkij,nkj,nklj->nil", at_scene, np.repeat(variances, 3, axis=2) * ratios, at_scene)
+        truth = np.repeat([p["truth_rotation"], p["truth_translation"]], 3)
+        return np.asarray(odometry + np.diag(truth**2))
+
+    def log_likelihood(self, p: dict[str, float], drift: Array, by_steps: bool) -> float:
+        """Of the errors beside a drift (6,) [rad/s, m/s], but for a constant."""
+        scales = self.covariances(p, by_steps)
         beside = self.errors - self.seconds[:, None] * drift
-        return sum(
-            multivariate_t.logpdf(error, shape=noise.covariance(motion), df=TAIL)
-            for error, motion in zip(beside, self.motions, strict=True)
-        )
+        squares = np.einsum("ni,ni->n", beside, np.linalg.solve(scales, beside[:, :, None])[:, :, 0])
+        tails = 0.5 * (TAIL + 6.0) * np.log1p(squares / TAIL)
+        return float(-np.sum(tails + 0.5 * np.linalg.slogdet(scales)[1]))
 
 
-def fit(recordings: Sequence[Motions], **fixed: float) -> tuple[float, dict[str, float]]:
-    """Greatest log-likelihood of a motion, and the settings that have it; those in `fixed` are not fitted."""
-    free = [i for i, name in enumerate(FIELDS) if name not in fixed]
-    count = sum(len(recording.errors) for recording in recordings)
+def about_scene(depth: float) -> Array:
+    """(6, 6) adjoint map from the scene to the camera."""
+    return np.asarray(gtsam.Pose3(gtsam.Rot3(), np.array([0.0, 0.0, depth])).AdjointMap())
+
+
+def read(folder: Path, images: int) -> Motions:
+    """The motions of a recording over so many images."""
+    truth, odometry = (Trajectory.of(read_trajectory(folder / f"{x}.txt")) for x in ("groundtruth", "odometry"))
+    covered, true = interpolated(truth, odometry.stamps)
+    times, measured = odometry.stamps[covered] / SECOND, [gtsam.Pose3(T) for T in odometry.poses[covered]]
+    logs = np.array([gtsam.Pose3.Logmap(a.between(b)) for a, b in pairwise(measured)])
+    steps = np.stack([np.linalg.norm(logs[:, :3], axis=1), np.linalg.norm(logs[:, 3:], axis=1)], axis=1)
+    durations = np.diff(times)
+    starts = range(0, len(times) - images, images)
+    wholes = [measured[i].between(measured[i + images]) for i in starts]
+    true_wholes = [gtsam.Pose3(np.linalg.inv(true[i]) @ true[i + images]) for i in starts]
+    lengths = np.array([gtsam.Pose3.Logmap(whole) for whole in wholes])
+    inside = np.array([np.arange(i, i + images) for i in starts])
+    return Motions(
+        np.array([gtsam.Pose3.Logmap(t.between(m)) for t, m in zip(true_wholes, wholes, strict=True)]),
+        np.array([times[i + images] - times[i] for i in starts]),
+        (steps / durations[:, None])[inside],
+        durations[inside],
+        np.array(
+            [[measured[i + images].between(measured[k + 1]).AdjointMap() for k in range(i, i + images)] for i in starts]
+        ),
+        np.stack([np.linalg.norm(lengths[:, :3], axis=1), np.linalg.norm(lengths[:, 3:], axis=1)], axis=1),
+    )
+
+
+Recording = Sequence[Motions]  # over several numbers of images
+
+
+def fit(recordings: Sequence[Recording], by_steps: bool, fixed: dict[str, float]) -> tuple[float, dict[str, float]]:
+    """Greatest log-likelihood of a motion, and the scales that have it; those in `fixed` are not fitted."""
+    free = [name for name in BEGIN if name not in fixed]
+    count = sum(len(motions.errors) for recording in recordings for motions in recording)
+    begin = np.concatenate([np.log([BEGIN[name] for name in free]), np.zeros(6 * len(recordings))])
+
+    def settings(x: Array) -> dict[str, float]:
+        return {**fixed, **dict(zip(free, np.exp(x[: len(free)]).tolist(), strict=True))}
 
     def cost(x: Array) -> float:
-        noise = MotionNoise(**dict(zip((FIELDS[i] for i in free), np.exp(x[: len(free)]), strict=True)), **fixed)
-        drifts = DRIFT_UNIT * x[len(free) :].reshape(-1, 6)
-        found = [recording.log_likelihood(noise, drift) for recording, drift in zip(recordings, drifts, strict=True)]
+        p, drifts = settings(x), DRIFT_UNIT * x[len(free) :].reshape(-1, 6)
+        found = [
+            motions.log_likelihood(p, drift, by_steps)
+            for recording, drift in zip(recordings, drifts, strict=True)
+            for motions in recording
+        ]
         return -sum(found) / count
 
-    begin = np.concatenate([BEGIN[free], np.zeros(6 * len(recordings))])
-    bounds = [*BOUNDS[free], *[(None, None)] * (6 * len(recordings))]
+    reach = float(np.log(FARTHEST))
+    bounds = [(x - reach, x + reach) for x in begin[: len(free)]] + [(None, None)] * (6 * len(recordings))
     found = minimize(cost, begin, method="L-BFGS-B", bounds=bounds)
-    return -float(found.fun), {FIELDS[i]: float(np.exp(value)) for i, value in zip(free, found.x, strict=False)}
+    return -float(found.fun), settings(found.x)
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     default = [DATA / "fr3_office", DATA / "fr1_desk"]
     parser.add_argument("folders", nargs="*", type=Path, default=default, metavar="FOLDER")
-    parser.add_argument("--images", type=int, default=10, help="between the ends of a motion (default: 10)")
-    arguments = parser.parse_args()
-    recordings = {folder.name: Motions(folder, arguments.images) for folder in arguments.folders}
-    groups: dict[str, Any] = {name: [found] for name, found in recordings.items()}
-    groups["together"] = list(recordings.values())
-    for name, found in groups.items():
-        errors = np.concatenate([recording.errors for recording in found])
-        usual = np.abs(errors) < 4.0 * np.median(np.abs(errors), axis=0) / 0.6745  # without gross failures
-        correlation = np.corrcoef(errors[usual.all(axis=1)].T)
-        print(f"{name}: {len(errors)} motions over {arguments.images} images")
-        print(f"  rotation about x with y {correlation[0, 4]:+.2f}, about y with x {correlation[1, 3]:+.2f}")
-        for title, fixed in (("independent in the camera", {"scene_depth": 0.0}), ("about the scene", {})):
-            value, settings = fit(found, **fixed)
-            print(f"  {title}: {value:.2f}", *(f"{key} {setting:.4f}" for key, setting in settings.items()))
-        value, _ = fit(found, **{name: getattr(MotionNoise(), name) for name in FIELDS})
-        print(f"  as the settings are: {value:.2f}", flush=True)
+    recordings = {folder.name: [read(folder, n) for n in IMAGES] for folder in parser.parse_args().folders}
+    to_scene = np.linalg.inv(about_scene(MotionNoise().scene_depth))
+    for name, recording in recordings.items():
+        print(f"{name}: median errors at the scene, rotation about x, y, z [mrad], translation [mm]")
+        for images, motions in zip(IMAGES, recording, strict=True):
+            errors = motions.errors @ to_scene.T
+            spread = 1e3 * np.median(np.abs(errors - np.median(errors, axis=0)), axis=0) / 0.6745
+            print(f"  {images:2} images, {len(errors):3} motions:", *(f"{value:5.1f}" for value in spread))
+    noise = MotionNoise()
+    as_set = {name: getattr(noise, name) / scale_of(name) for name in BEGIN if not name.startswith("truth")}
+    groups = {**{name: [recording] for name, recording in recordings.items()}, "together": list(recordings.values())}
+    for name, group in groups.items():
+        print(name)
+        for title, by_steps, fixed in (("whole", False, {}), ("steps", True, {}), ("steps, as set", True, as_set)):
+            value, found = fit(group, by_steps, fixed)
+            print(
+                f"  {title}: {value:.2f}", *(f"{key} {p * scale_of(key):.4f}" for key, p in found.items()), flush=True
+            )
+
+
+def scale_of(name: str) -> float:
+    """What turns a fitted parameter into a setting: deviations are those of the distribution, not its scales."""
+    return TO_DEVIATION if name in DEVIATIONS else 1.0
 
 
 if __name__ == "__main__":
