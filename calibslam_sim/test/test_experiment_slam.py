@@ -149,6 +149,32 @@ def test_tum_gives_few_conditions_a_third_of_the_images(folder: Path, monkeypatc
     assert same == few  # conditions are compared on the same images
 
 
+def test_tum_gives_sparse_conditions_the_same_objects(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    settings = tum.TumSettings(folder=str(folder))
+    given = reaching_the_back_end(
+        settings, ("real_given_fixed", "sparse_given_fixed", "sparse_estimated_calibrated"), monkeypatch
+    )
+    usual, sparse, same = (
+        [(boxes.stamp, boxes.object_ids, boxes.corners.tolist()) for boxes in images] for _, images in given
+    )
+    assert sparse == same
+    there, left = ({name for _, names, _ in images for name in names} for images in (usual, sparse))
+    assert left < there and len(left) > 0.3 * len(there)
+    for (stamp, names, corners), (same_stamp, kept, kept_corners) in zip(usual, sparse, strict=True):
+        assert stamp == same_stamp
+        assert kept_corners == [c for name, c in zip(names, corners, strict=True) if name in left]
+        assert list(kept) == [name for name in names if name in left]
+
+
+def test_sparse_leaves_boxes_without_label() -> None:
+    corners = np.array([[10.0, 10.0, 50.0, 50.0], [60.0, 10.0, 90.0, 50.0], [100.0, 10.0, 150.0, 50.0]])
+    boxes = Boxes(0, 640, 480, corners, np.full((3, 4, 4), np.nan), ("cup",) * 3, np.ones(3), ("a", "", "b"))
+    found = tum.sparse([boxes] * 3, 1.0 - 1e-9, np.random.default_rng(0))
+    assert [each.object_ids for each in found] == [("",)] * 3
+    np.testing.assert_array_equal(found[2].corners, corners[1:2])
+    assert tum.sparse([boxes], 0.0, np.random.default_rng(0))[0].object_ids == boxes.object_ids
+
+
 def test_tum_gives_failing_conditions_the_same_failures(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     settings = tum.TumSettings(folder=str(folder))
     monkeypatch.setattr(tum, "OdometryFailures", lambda: OdometryFailures(every=1.0))

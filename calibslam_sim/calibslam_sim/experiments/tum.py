@@ -9,13 +9,16 @@ Families of conditions:
         errors of its odometry are the same; what is known when, and so which objects begin and who takes which box,
         is not. What hangs on the order of things shows here.
     few_given_..., few_estimated_...: every third image only, drawn at random, as a detector a third as fast would give.
+    sparse_given_..., sparse_estimated_...: a third of the labelled objects, drawn at random, are not there, as in a scene
+        that is another one: which objects there are decides more than which images.
     failing_given_..., failing_estimated_...: the odometry fails about every 15 s besides, for up to a second: it says
         anything, or that nothing moved (`failing_odometry`).
 Two more, real_given_underconfident and real_given_scale_4, believe calibrated deviations to be 2 and 4 times as large:
 if errors are alike from image to image, what is right for each box is too confident for a row of them.
 With real odometry each repetition leaves out another tenth of the images (`few_`: two thirds): their spread tells how
 far a result hangs on single images, not how it would be on other recordings. Two repetitions share nine tenths of their
-images, and a third where there are few: these are nearer to repetitions that know nothing of each other.
+images, and a third where there are few: these are nearer to repetitions that know nothing of each other. Two
+`sparse_` ones share two thirds of their objects.
 """
 
 from __future__ import annotations
@@ -65,7 +68,7 @@ NOISE = {
     UNDERCONFIDENT: (OWN_COVARIANCE, 2.0),
     scale_name(4.0): (OWN_COVARIANCE, 4.0),
 }
-REAL_GIVEN, BACKWARDS, FEW, FAILING = "real_given_", "backwards_", "few_", "failing_"
+REAL_GIVEN, BACKWARDS, FEW, SPARSE, FAILING = "real_given_", "backwards_", "few_", "sparse_", "failing_"
 # Prefix of a condition -> association.
 REAL = {
     REAL_GIVEN: GIVEN,
@@ -74,6 +77,8 @@ REAL = {
     BACKWARDS + "estimated_": ESTIMATED,
     FEW + "given_": GIVEN,
     FEW + "estimated_": ESTIMATED,
+    SPARSE + "given_": GIVEN,
+    SPARSE + "estimated_": ESTIMATED,
     FAILING + "given_": GIVEN,
     FAILING + "estimated_": ESTIMATED,
 }
@@ -96,6 +101,7 @@ class TumSettings(ExperimentSettings):
     translation_noise: float = setting(0.01, "added to each step of it, along each axis", unit="m", low=1e-6)
     left_out: float = setting(0.1, "share of images left out where odometry is real", low=0.0, high=0.9)
     left_out_of_few: float = setting(2.0 / 3.0, "the same in `few_` conditions", low=0.0, high=0.9)
+    left_out_objects: float = setting(1.0 / 3.0, "share of objects left out in `sparse_` conditions", low=0.0, high=0.9)
     most_images: int = setting(1_000_000, "of the recording, from its beginning", low=10)
 
 
@@ -142,6 +148,8 @@ def run(settings: TumSettings, condition: str, seed: Seed) -> Metrics:
         left_out = settings.left_out_of_few if family.startswith(FEW) else settings.left_out
         kept = rng.random(len(images)) >= left_out
         images = [boxes for boxes, keep in zip(images, kept, strict=True) if keep]
+        if family.startswith(SPARSE):
+            images = sparse(images, settings.left_out_objects, rng)
         if family.startswith(FAILING):
             motions = OdometryFailures().spoil(motions, rng)
     else:
@@ -156,6 +164,16 @@ def run(settings: TumSettings, condition: str, seed: Seed) -> Metrics:
         return accuracy_of_trajectory(result, recording.truth)
     except NoGroundTruth as error:
         raise ExperimentError(f"{settings.folder}: {error}") from error
+
+
+def sparse(images: list[Boxes], left_out: float, rng: np.random.Generator) -> list[Boxes]:
+    """The images without the boxes of a share of the labelled objects; boxes without label stay."""
+    names = sorted({name for boxes in images for name in boxes.object_ids if name})
+    gone = {name for name in names if rng.random() < left_out}
+    return [
+        boxes.select(np.array([i for i, name in enumerate(boxes.object_ids) if name not in gone], dtype=int))
+        for boxes in images
+    ]
 
 
 @lru_cache(maxsize=1)
