@@ -9,8 +9,8 @@ Families of conditions:
         errors of its odometry are the same; what is known when, and so which objects begin and who takes which box,
         is not. What hangs on the order of things shows here.
     few_given_..., few_estimated_...: every third image only, drawn at random, as a detector a third as fast would give.
-    sparse_given_..., sparse_estimated_...: a third of the labelled objects, drawn at random, are not there, as in a scene
-        that is another one: which objects there are decides more than which images.
+    sparse_given_..., sparse_estimated_...: a third of the labelled objects, drawn at random, are not there: what hangs
+        on single objects, which decide more than single images.
     failing_given_..., failing_estimated_...: the odometry fails about every 15 s besides, for up to a second: it says
         anything, or that nothing moved (`failing_odometry`).
 Two more, real_given_underconfident and real_given_scale_4, believe calibrated deviations to be 2 and 4 times as large:
