@@ -5,7 +5,6 @@ from __future__ import annotations
 from bisect import bisect_right
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
-from itertools import pairwise
 
 import gtsam
 import numpy as np
@@ -83,7 +82,7 @@ class _Step:
         measured: the same, nothing bridged.
         covariance: (6, 6) of the motion, in the camera at its end.
         unseen: (6,) what the body may have done unseen besides [rad, m].
-        drifts: whether it does.
+        drifts: whether odometry's constant drift is in it.
     """
 
     end: int
@@ -196,8 +195,9 @@ class MotionChain:
         )
 
     def _stay(self, time: int, unseen: float) -> None:
-        """Up to this time nothing is measured."""
-        pose, measured = (self._steps[-1].pose, self._steps[-1].measured) if self._steps else 2 * (gtsam.Pose3(),)
+        """Nothing is measured up to this time, and the body may do so much [rad, m]."""
+        origin = gtsam.Pose3()
+        pose, measured = (self._steps[-1].pose, self._steps[-1].measured) if self._steps else (origin, origin)
         self._steps.append(_Step(time, pose, measured, np.zeros((6, 6)), np.full(6, unseen), drifts=False))
 
     def motion(self, start: int, end: int) -> Array:
@@ -232,7 +232,8 @@ class MotionChain:
 
     def _inside(self, start: int, end: int) -> Iterator[tuple[_Step, float, float]]:
         """The steps between two times [ns], the share of each that lies between them, and how long [s] that is."""
-        for before, step in pairwise(self._steps[max(self._after(start) - 1, 0) :]):
+        for i in range(max(self._after(start), 1), len(self._steps)):
+            before, step = self._steps[i - 1 : i + 1]
             duration = min(end, step.end) - max(start, before.end)
             if duration <= 0:
                 return
