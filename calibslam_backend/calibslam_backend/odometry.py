@@ -162,7 +162,7 @@ class MotionChain:
         step = gtsam.Pose3.Expmap(believed.velocity * seconds) if believed.variance.any() else measured
         unseen = np.sqrt(believed.variance)
         if covariance is None:
-            noise = self._noise.covariance(gtsam.Pose3.Logmap(step), seconds)
+            noise = self._noise.covariance(believed.velocity, seconds)
         else:
             noise = self._closed(covariance, seconds)
             is_open = np.diag(covariance) > self.OPEN**2

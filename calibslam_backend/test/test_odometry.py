@@ -277,9 +277,9 @@ def test_unknown_covariances_by_hand() -> None:
         translation_share=0.1,
         scene_depth=0.0,
     )
-    turn = noise.covariance(0.25 * np.array([0.0, 0.5, 0.0, 0.0, 0.0, 0.0]), 0.25)
+    turn = noise.covariance(np.array([0.0, 0.5, 0.0, 0.0, 0.0, 0.0]), 0.25)
     np.testing.assert_allclose(np.sqrt(np.diag(turn)), np.array([0.05, 0.05, 0.025] + [0.01] * 3) / 2.0)
-    move = noise.covariance(0.25 * np.array([0.0, 0.0, 0.0, 0.0, 0.24, 0.0]), 0.25)
+    move = noise.covariance(np.array([0.0, 0.0, 0.0, 0.0, 0.24, 0.0]), 0.25)
     np.testing.assert_allclose(np.sqrt(np.diag(move)), np.array([0.03, 0.03, 0.015] + [0.026] * 3) / 2.0)
     assert np.count_nonzero(turn) == 6
 
@@ -345,7 +345,7 @@ def test_steps_of_unknown_covariance_add_to_those_that_state_one() -> None:
     """By hand: each step's covariance, seen from the camera at the end."""
     moves = steps(3)
     chain = chain_of([motion(0, moves[0]), motion(1, moves[1], None), motion(2, moves[2])])
-    unknown = MotionNoise().covariance(log(moves[1]), STEP / SECOND)
+    unknown = MotionNoise().covariance(log(moves[1]) * SECOND / STEP, STEP / SECOND)
     expected = COVARIANCE
     for move, noise in ((moves[1], unknown), (moves[2], COVARIANCE)):
         back = move.inverse().AdjointMap()

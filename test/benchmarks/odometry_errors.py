@@ -3,9 +3,10 @@
     ./calibslam shell -c 'python test/benchmarks/odometry_errors.py [FOLDER ...]'
 
 FOLDER is in TUM format, with odometry.txt and groundtruth.txt (default: both recordings of the shared data). For
-motions over 3, 6, 12 and 24 images: how large their errors at the scene are, and under which settings all of them are
-likeliest (Student's t with 4 degrees of freedom, whose standard deviation is printed; for each recording a constant
-drift; the truth itself has errors of its own, the same for short and long motions, which are fitted beside):
+motions over 3, 6, 12 and 24 images: how large their errors at the scene are, how those in the camera about and along
+its axes correlate, and under which settings all of them are likeliest (Student's t with 4 degrees of freedom, whose
+standard deviation is printed; for each recording a constant drift; the truth itself has errors of its own, the same for
+short and long motions, which are fitted beside):
 
     steps: the variance grows with each step, by floor^2 + (share * velocity)^2 in a second, as in `MotionNoise`;
     whole: it is that of the whole motion, floor^2 + (share * motion)^2, however long it took.
@@ -53,7 +54,6 @@ class Motions:
 
     Attributes:
         errors: (N, 6) [rad, m] of odometry.
-        seconds: (N,) durations.
         velocities: (N, K, 2) of each step, of rotation and of translation [rad/s, m/s].
         durations: (N, K) of each step [s].
         to_end: (N, K, 6, 6) adjoint maps from the camera after each step to that at the end.
@@ -61,7 +61,6 @@ class Motions:
     """
 
     errors: Array
-    seconds: Array
     velocities: Array
     durations: Array
     to_end: Array
@@ -86,7 +85,7 @@ class Motions:
     def log_likelihood(self, p: dict[str, float], drift: Array, by_steps: bool) -> float:
         """Of the errors beside a drift (6,) [rad/s, m/s], but for a constant."""
         scales = self.covariances(p, by_steps)
-        beside = self.errors - self.seconds[:, None] * drift
+        beside = self.errors - self.durations.sum(axis=1, keepdims=True) * drift
         squares = np.einsum("ni,ni->n", beside, np.linalg.solve(scales, beside[:, :, None])[:, :, 0])
         tails = 0.5 * (TAIL + 6.0) * np.log1p(squares / TAIL)
         return float(-np.sum(tails + 0.5 * np.linalg.slogdet(scales)[1]))
@@ -97,29 +96,36 @@ def about_scene(depth: float) -> Array:
     return np.asarray(gtsam.Pose3(gtsam.Rot3(), np.array([0.0, 0.0, depth])).AdjointMap())
 
 
-def read(folder: Path, images: int) -> Motions:
-    """The motions of a recording over so many images."""
+def read(folder: Path) -> list[Motions]:
+    """The motions of a recording, for each number of images."""
     truth, odometry = (Trajectory.of(read_trajectory(folder / f"{x}.txt")) for x in ("groundtruth", "odometry"))
-    covered, true = interpolated(truth, odometry.stamps)
-    times, measured = odometry.stamps[covered] / SECOND, [gtsam.Pose3(T) for T in odometry.poses[covered]]
-    logs = np.array([gtsam.Pose3.Logmap(a.between(b)) for a, b in pairwise(measured)])
-    steps = np.stack([np.linalg.norm(logs[:, :3], axis=1), np.linalg.norm(logs[:, 3:], axis=1)], axis=1)
-    durations = np.diff(times)
-    starts = range(0, len(times) - images, images)
-    wholes = [measured[i].between(measured[i + images]) for i in starts]
-    true_wholes = [gtsam.Pose3(np.linalg.inv(true[i]) @ true[i + images]) for i in starts]
-    lengths = np.array([gtsam.Pose3.Logmap(whole) for whole in wholes])
-    inside = np.array([np.arange(i, i + images) for i in starts])
-    return Motions(
-        np.array([gtsam.Pose3.Logmap(t.between(m)) for t, m in zip(true_wholes, wholes, strict=True)]),
-        np.array([times[i + images] - times[i] for i in starts]),
-        (steps / durations[:, None])[inside],
-        durations[inside],
-        np.array(
-            [[measured[i + images].between(measured[k + 1]).AdjointMap() for k in range(i, i + images)] for i in starts]
-        ),
-        np.stack([np.linalg.norm(lengths[:, :3], axis=1), np.linalg.norm(lengths[:, 3:], axis=1)], axis=1),
-    )
+    covered, found = interpolated(truth, odometry.stamps)
+    true, measured = ([gtsam.Pose3(T) for T in poses] for poses in (found, odometry.poses[covered]))
+    durations = np.diff(odometry.stamps[covered]) / SECOND
+    velocities = lengths([a.between(b) for a, b in pairwise(measured)]) / durations[:, None]
+    result = []
+    for images in IMAGES:
+        starts = range(0, len(measured) - images, images)
+        inside = np.array([np.arange(i, i + images) for i in starts])
+        wholes = [measured[i].between(measured[i + images]) for i in starts]
+        errors = [true[i].between(true[i + images]).between(whole) for i, whole in zip(starts, wholes, strict=True)]
+        to_end = [[measured[row[-1] + 1].between(measured[k + 1]).AdjointMap() for k in row] for row in inside]
+        result.append(
+            Motions(
+                np.array([gtsam.Pose3.Logmap(error) for error in errors]),
+                velocities[inside],
+                durations[inside],
+                np.array(to_end),
+                lengths(wholes),
+            )
+        )
+    return result
+
+
+def lengths(motions: Sequence[gtsam.Pose3]) -> Array:
+    """(N, 2) rotation and translation [rad, m]."""
+    logarithms = np.array([gtsam.Pose3.Logmap(motion) for motion in motions])
+    return np.linalg.norm(logarithms.reshape(-1, 2, 3), axis=2)
 
 
 Recording = Sequence[Motions]  # over several numbers of images
@@ -153,14 +159,23 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     default = [DATA / "fr3_office", DATA / "fr1_desk"]
     parser.add_argument("folders", nargs="*", type=Path, default=default, metavar="FOLDER")
-    recordings = {folder.name: [read(folder, n) for n in IMAGES] for folder in parser.parse_args().folders}
+    recordings = {folder.name: read(folder) for folder in parser.parse_args().folders}
     to_scene = np.linalg.inv(about_scene(MotionNoise().scene_depth))
     for name, recording in recordings.items():
-        print(f"{name}: median errors at the scene, rotation about x, y, z [mrad], translation [mm]")
+        print(
+            f"{name}: median errors at the scene, rotation about x, y, z [mrad], translation [mm]; "
+            "correlation of rotation about x with translation along y, about y with x, without gross failures"
+        )
         for images, motions in zip(IMAGES, recording, strict=True):
             errors = motions.errors @ to_scene.T
             spread = 1e3 * np.median(np.abs(errors - np.median(errors, axis=0)), axis=0) / 0.6745
-            print(f"  {images:2} images, {len(errors):3} motions:", *(f"{value:5.1f}" for value in spread))
+            usual = np.abs(motions.errors) < 4.0 * np.median(np.abs(motions.errors), axis=0) / 0.6745
+            correlation = np.corrcoef(motions.errors[usual.all(axis=1)].T)
+            print(
+                f"  {images:2} images, {len(errors):3} motions:",
+                *(f"{value:5.1f}" for value in spread),
+                f"; {correlation[0, 4]:+.2f} {correlation[1, 3]:+.2f}",
+            )
     noise = MotionNoise()
     as_set = {name: getattr(noise, name) / scale_of(name) for name in BEGIN if not name.startswith("truth")}
     groups = {**{name: [recording] for name, recording in recordings.items()}, "together": list(recordings.values())}
