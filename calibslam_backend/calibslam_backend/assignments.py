@@ -178,6 +178,15 @@ class Assignments:
             self.give(k, n, j)
         candidate.quadric, candidate.misfits = j, 0
 
+    def move(self, tracks: dict[int, int]) -> None:
+        """These tracks are of other quadrics than they were bound to: all of their boxes go there, at once, since one
+        may have to make room for the next."""
+        for track in tracks:
+            for k, n in self.tracks[track].seen:
+                self.take(k, n)
+        for track, j in tracks.items():
+            self.bind(track, j)
+
     def rebind(self, track: int, least: int) -> None:
         """The track belongs to the quadric that most of its boxes are given to, if they are so many at least."""
         candidate = self.tracks[track]

@@ -1,35 +1,31 @@
-"""Which quadric a track is of: quadrics begun, bound to tracks, and found again.
+"""Which quadric of the map a track is of.
 
 A track is open until it is bound to a quadric, which happens when several keyframes agree on one (`vote`,
-`relocalise`) or when its own boxes determine a new one (`start_quadrics`). What turns out to be wrong is mended in
+`relocalise`) or when its own boxes determine a new one (`new_quadrics`). What turns out to be wrong is mended in
 `upkeep`.
 """
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable
 from dataclasses import replace
 
 import numpy as np
 
-from calibslam_backend.assignments import Assignments, Candidate, Frame
+from calibslam_backend.assignments import Assignments, Frame
 from calibslam_backend.association import (
     GIVEN,
     Prediction,
     Votes,
     assign,
     distances,
-    explains,
     predict,
     predicted_corners,
-    same_object,
     unambiguous,
 )
 from calibslam_backend.box_measurement import BoxMeasurement, prepare
 from calibslam_backend.estimator_settings import EstimatorSettings
 from calibslam_backend.graph import ObjectGraph, UpdateReport
-from calibslam_backend.initialisation import initialise_by_newest
 from calibslam_backend.innovation import innovations
 from calibslam_backend.localisation import localise
 from calibslam_backend.noise import NoiseModel, spread
@@ -60,6 +56,8 @@ class DataAssociation:
         self._graph: ObjectGraph = assignments.graph
         self._noise = NoiseModel(settings)
         self._votes = Votes(settings.votes)
+        # (bound quadric, the one that it was found to be) -> tracks of which it was found.
+        self._taken_for: dict[tuple[int, int], set[int]] = {}
 
     def frame(self, boxes: Boxes, tracks: list[int]) -> Frame:
         """The boxes of an image made ready, with the covariances the noise model gives them."""
@@ -163,9 +161,10 @@ class DataAssociation:
     def _vote_for(self, track: int, landmark: int) -> None:
         decided = self._votes.add(track, landmark)
         if decided is not None and not self._assignments.seen_apart(self._assignments.tracks[track], decided):
-            self._bind(track, decided)
+            self.bind(track, decided)
 
-    def _bind(self, track: int, j: int) -> None:
+    def bind(self, track: int, j: int) -> None:
+        """The track is of this quadric."""
         self._assignments.bind(track, j)
         self._votes.forget(track)
         self.counts["bound"] += 1
@@ -179,7 +178,7 @@ class DataAssociation:
     def bind_found(self, frame: Frame, found: Relocalised) -> None:
         """The boxes of the keyframe where the camera was found belong to the quadrics that it was found by."""
         for n, j in found.pairs:
-            self._bind(frame.tracks[n], j)
+            self.bind(frame.tracks[n], j)
 
     def relocalise(self, k: int) -> None:
         """Where the boxes show known objects from another pose than the predicted one, vote for those."""
@@ -196,13 +195,29 @@ class DataAssociation:
         if found is None:
             return
         self.counts["relocalised"] += 1
+        moved: dict[int, int] = {}
         for n, j in found.pairs:
             track = frame.tracks[n]
             bound = self._assignments.tracks[track].quadric
             if bound is None:
                 self._vote_for(track, j)
-            elif bound != j and self._votes.add(~bound, j) == j:
-                self._assignments.same.append((bound, j))
+            elif bound != j:
+                self._taken_for.setdefault((bound, j), set()).add(track)
+                if self._votes.add(~bound, j) == j:
+                    moved.update(self._mended(bound, j))
+        self._assignments.move(moved)
+        self.counts["moved"] += len(moved)
+
+    def _mended(self, bound: int, j: int) -> dict[int, int]:
+        """Tracks that are bound to one quadric and are of another: both are to be united, if images do not show both;
+        otherwise it was these tracks that were bound wrongly, as to the next bottle of a row, and they go to the
+        other."""
+        if not self._assignments.seen_beside(bound, j):
+            self._assignments.same.append((bound, j))
+            return {}
+        tracks = sorted(self._taken_for.pop((bound, j)))
+        self._votes.forget(~bound)
+        return {track: j for track in tracks if self._assignments.tracks[track].quadric == bound}
 
     def _is_recent(self, track: int) -> bool:
         """Whether a track is open, or bound to a young quadric."""
@@ -234,48 +249,6 @@ class DataAssociation:
             is_plausible,
         )
         return found and replace(found, pairs=[(n, known[m]) for n, m in found.pairs])
-
-    # -- new quadrics -------------------------------------------------------------------------------------------
-
-    def start_quadrics(self, tracks: Iterable[int]) -> None:
-        """Begin a quadric for each open track whose boxes determine one."""
-        frames = self._assignments.frames
-        for track in tracks:
-            candidate = self._assignments.tracks[track]
-            rows = self._assignments.open_rows(candidate)
-            if candidate.quadric is not None or len(rows) < self.settings.min_boxes:
-                continue
-            poses = np.stack([self._graph.pose(k) for k, _ in rows])
-            boxes = [frames[k].boxes[n] for k, n in rows]
-            first = initialise_by_newest(poses, boxes, self.camera.K, self.settings.robust_scale, self.settings)
-            if first is None:
-                continue
-            known = self._same_as(first.vector, candidate, poses, boxes)
-            self._bind(track, self._assignments.begin(first.vector) if known is None else known)
-
-    def start_leftovers(self) -> None:
-        """`start_quadrics` for every open track: with better poses, some determine a quadric that did not before."""
-        self.start_quadrics([t for t, candidate in self._assignments.tracks.items() if candidate.quadric is None])
-
-    def _same_as(self, vector: Array, candidate: Candidate, poses: Array, boxes: list[BoxMeasurement]) -> int | None:
-        """The quadric that this one, of a track's boxes seen from these poses, is, if the map has it."""
-        if self.settings.association == GIVEN:
-            return None
-        ids, vectors = self._graph.quadrics()
-        if not ids:
-            return None
-        same = same_object(vector, vectors, self.settings.merge_distance)
-        for n in np.argsort(np.linalg.norm(vectors[:, :3] - vector[:3], axis=1)):
-            j = ids[n]
-            classes = self._assignments.classes[j]
-            if (
-                same[n]
-                and classes.keys() & candidate.classes.keys()
-                and not self._assignments.seen_apart(candidate, j)
-                and explains(vectors[n], poses, boxes, self.camera.K)
-            ):
-                return j
-        return None
 
     # -- the graph ----------------------------------------------------------------------------------------------
 

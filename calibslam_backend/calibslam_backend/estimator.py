@@ -28,6 +28,7 @@ from calibslam_backend.data_association import DataAssociation
 from calibslam_backend.estimator_settings import EstimatorSettings
 from calibslam_backend.graph import Motion, ObjectGraph, UpdateReport
 from calibslam_backend.kernels import load_kernels
+from calibslam_backend.new_quadrics import NewQuadrics
 from calibslam_backend.noise import QUADRICSLAM
 from calibslam_backend.object_map import ObjectMap
 from calibslam_backend.odometry import MotionChain
@@ -101,6 +102,7 @@ class Estimator:
         self._graph = ObjectGraph(self.camera.K, self.settings, self.settings, self.settings)
         self._assignments = Assignments(self._graph)
         self._objects = DataAssociation(self._assignments, self.camera, self.settings, self.counts)
+        self._new = NewQuadrics(self._assignments, self.camera, self.settings, self._objects.bind, self.counts)
         self._upkeep = Upkeep(self._assignments, self.camera, self.settings, self.counts)
         self._known: Set[int] = set()  # quadrics after the last keyframe
         self._repairs: list[str] = []
@@ -171,7 +173,7 @@ class Estimator:
             return
         for _ in range(self.ROUNDS):
             changed = self._upkeep.revise()
-            self._objects.start_leftovers()
+            self._new.start_leftovers()
             self._converge(self.ITERATIONS_OF_A_ROUND)
             self._upkeep.merge()
             if not changed:
@@ -395,14 +397,17 @@ class Estimator:
         def look_for_known_and_new() -> None:
             if k:
                 objects.relocalise(k)
-            objects.start_quadrics(self._assignments.frames[k].tracks)
+            self._new.start(self._assignments.frames[k].tracks)
+
+        def join() -> None:
+            self._new.join_ended(k)
 
         def revise() -> None:
             self._upkeep.revise(-(-self.settings.revised // 2))
 
         # Every update has a price of its own, whatever it relinearises.
         last = [] if k % self.SETTLE_EVERY else [self._settle]
-        return [look_for_known_and_new, revise, revise, *last]
+        return [look_for_known_and_new, join, revise, revise, *last]
 
     def _settle(self) -> None:
         report = self._graph.settle()

@@ -27,7 +27,7 @@ FREE = 1e3  # standard deviation of a prior that says nothing [m, log m]
 
 @dataclass(frozen=True)
 class InitialisationSettings(Settings):
-    min_boxes: int = setting(4, "boxes an object needs", low=3)
+    min_boxes: int = setting(4, "boxes an object needs", low=2)
     max_boxes: int = setting(40, "boxes of an object that are looked at", low=3)
     max_depth_uncertainty: float = setting(
         0.1, "largest standard deviation of the centre, as a share of its distance", low=0.0, high=1.0
