@@ -14,6 +14,7 @@ from calibslam_backend.data_association import DataAssociation
 from calibslam_backend.estimator_settings import EstimatorSettings
 from calibslam_backend.graph import Motion, ObjectGraph
 from calibslam_backend.kernels import load_kernels
+from calibslam_backend.new_quadrics import NewQuadrics
 from calibslam_backend.quadric import ALL_EDGES, Ellipsoid, box_of_visible_part, image_bounds
 from calibslam_backend.upkeep import Upkeep
 from calibslam_msgs_py.measurements import Array, Boxes, Camera
@@ -36,7 +37,8 @@ class World:
         self.books = Assignments(self.graph)
         self.counts: Counter[str] = Counter()
         self.upkeep = Upkeep(self.books, CAMERA, s, self.counts)
-        self.objects = DataAssociation(self.books, CAMERA, s, self.counts)
+        objects = DataAssociation(self.books, CAMERA, s, self.counts)
+        self.new = NewQuadrics(self.books, CAMERA, s, objects.bind, self.counts)
         self.graph.add_origin()
         step = np.eye(4)
         step[0, 3] = 0.05
@@ -153,7 +155,7 @@ def test_what_is_near_is_no_new_object_if_it_explains_the_boxes(place: tuple[flo
     for k in range(FRAMES):
         world.show((LEFT, 0) if k < 2 else (place, 1))
     world.books.bind(0, first)
-    world.objects.start_quadrics([1])
+    world.new.start([1])
     assert sorted(world.graph.landmarks) == ([first] if one else [first, first + 1])
     world.upkeep.merge()
     assert world.books.tracks[1].quadric == (first if one else first + 1)
