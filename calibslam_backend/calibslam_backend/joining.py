@@ -40,9 +40,7 @@ class Joined:
     vector: Array
 
 
-def join(
-    glimpses: Sequence[Glimpse], K: Array, robust_scale: float, settings: InitialisationSettings
-) -> list[Joined]:
+def join(glimpses: Sequence[Glimpse], K: Array, robust_scale: float, settings: InitialisationSettings) -> list[Joined]:
     """The objects that are told by two or more of these glimpses together; no glimpse is of two.
 
     Args:
@@ -74,9 +72,9 @@ def join(
         vector = quadric((a, b), of_pairs)
         if vector is not None:
             also = np.flatnonzero(meeting[a] & meeting[b]).tolist()
-            group = _supporters(vector, [a, b, *also], glimpses, K)
-            if {a, b} <= set(group) and number(group) >= settings.min_boxes:
-                groups[tuple(group)] = None
+            supporters = _supporters(vector, [a, b, *also], glimpses, K)
+            if {a, b} <= set(supporters) and number(supporters) >= settings.min_boxes:
+                groups[tuple(supporters)] = None
     joined: list[Joined] = []
     taken: set[int] = set()
     for group in sorted(groups, key=number, reverse=True):
@@ -93,10 +91,10 @@ def _supporters(vector: Array, candidates: list[int], glimpses: Sequence[Glimpse
     keyframes: set[int] = set()
     for n in candidates:
         glimpse = glimpses[n]
-        if keyframes.isdisjoint(glimpse.keyframes):
-            if median_overlap(glimpse.poses, glimpse.boxes, vector, K) >= SUPPORT:
-                group.append(n)
-                keyframes.update(glimpse.keyframes)
+        alone = keyframes.isdisjoint(glimpse.keyframes)
+        if alone and median_overlap(glimpse.poses, glimpse.boxes, vector, K) >= SUPPORT:
+            group.append(n)
+            keyframes.update(glimpse.keyframes)
     return sorted(group)
 
 
