@@ -1,4 +1,4 @@
-"""Objects that the map does not have yet: a quadric for an open track, or a group of them, whose boxes determine one."""
+"""Objects that the map does not have yet: a quadric for an open track, or a group, whose boxes determine one."""
 
 from __future__ import annotations
 
