@@ -75,7 +75,7 @@ def test_relocalisation_moves_tracks_that_are_bound_to_neighbours(times: int, mo
     """Once it has found so in three keyframes, since images show both quadrics."""
     world = swapped()
     monkeypatch.setattr(data_association, "relocalise", lambda *_: Relocalised(np.eye(4), [(0, 0), (1, 1)]))
-    monkeypatch.setattr(Assignments, "YOUNG", -1)  # all quadrics are old
+    monkeypatch.setattr(Assignments, "YOUNG", -FRAMES)  # all quadrics are old
     monkeypatch.setattr(world.objects, "_is_recent", lambda track: True)
     monkeypatch.setattr(world.graph, "is_solved", lambda j: True)
     for k in range(times):
