@@ -8,7 +8,7 @@ graph. An object that cannot be told yet (too few views, rays too parallel) wait
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numba
 import numpy as np
@@ -50,11 +50,16 @@ class InitialisationSettings(Settings):
         The first guess knows proportions, but hardly sizes: early objects all share the error that odometry had
         made by then, and a prior on their sizes would make it the scale of the map.
         """
-        covariance = np.eye(9) * self.prior_centre**2
-        size = np.array([1.0, 1.0, 1.0, 0.0, 0.0, 0.0]) / np.sqrt(3.0)
-        share = np.outer(size, size)
-        covariance[3:, 3:] = self.prior_shape**2 * (np.eye(6) - share) + self.prior_size**2 * share
-        return covariance
+        return _prior_covariance(self.prior_centre, self.prior_shape, self.prior_size)
+
+
+def _prior_covariance(centre: float, shape: float, size: float) -> Array:
+    """(9, 9) from the standard deviations of centre, proportions and size."""
+    covariance = np.eye(9) * centre**2
+    direction = np.array([1.0, 1.0, 1.0, 0.0, 0.0, 0.0]) / np.sqrt(3.0)
+    share = np.outer(direction, direction)
+    covariance[3:, 3:] = shape**2 * (np.eye(6) - share) + size**2 * share
+    return covariance
 
 
 @dataclass(frozen=True)
@@ -107,8 +112,8 @@ def initialise(
     )
     covariance = np.linalg.inv(information)
     # What the boxes say of centre and size must not be helped by priors that are but a first guess.
-    free = replace(settings, prior_centre=FREE, prior_size=FREE)
-    by_boxes = np.linalg.inv(information - prior + np.linalg.inv(free.prior_covariance()))
+    free = np.linalg.inv(_prior_covariance(FREE, settings.prior_shape, FREE))
+    by_boxes = np.linalg.inv(information - prior + free)
     depth = np.median(np.linalg.norm(poses[:, :3, 3] - vector[:3], axis=1))
     centre_sigma = np.sqrt(np.linalg.eigvalsh(by_boxes[:3, :3])[-1])
     largest = Ellipsoid.from_vector(vector).radii.max()

@@ -55,6 +55,9 @@ def join(glimpses: Sequence[Glimpse], K: Array, robust_scale: float, settings: I
         most = sorted(range(len(glimpses)), key=lambda n: -len(glimpses[n].boxes))[:MOST]
         some = join([glimpses[n] for n in most], K, robust_scale, settings)
         return [Joined(sorted(most[n] for n in each.glimpses), each.vector) for each in some]
+    meeting = rays_meet(glimpses, K)
+    if not meeting.any():
+        return []
     of_pairs = replace(settings, min_boxes=2)
 
     def quadric(group: Sequence[int], demanded: InitialisationSettings) -> Array | None:
@@ -66,7 +69,6 @@ def join(glimpses: Sequence[Glimpse], K: Array, robust_scale: float, settings: I
     def number(group: Sequence[int]) -> int:
         return sum(len(glimpses[n].boxes) for n in group)
 
-    meeting = rays_meet(glimpses, K)
     groups: dict[tuple[int, ...], None] = {}  # each once, in a fixed order
     for a, b in np.argwhere(np.triu(meeting)).tolist():
         vector = quadric((a, b), of_pairs)
