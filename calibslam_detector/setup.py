@@ -32,6 +32,6 @@ setup(
             f"fit_calibrator = {PACKAGE}.fit_calibrator:main",
             f"train = {PACKAGE}.train:main",
         ],
-        "calibslam.calibrators": [f"default = {PACKAGE}.calibrator:load"],
+        "calibslam.calibrators": [f"default = {PACKAGE}.foreign_boxes.calibrator:load"],
     },
 )

@@ -9,15 +9,15 @@ import numpy as np
 import pytest
 
 from calibslam_detector import detect_bag, evaluate_detector
-from calibslam_detector.detector import Detector, DetectorSettings
-from calibslam_detector.matching import match
-from calibslam_detector.weights_file import SHIPPED
+from calibslam_detector.model.detector import Detector, DetectorSettings
+from calibslam_detector.model.weights_file import SHIPPED
+from calibslam_detector.training.matching import match
 from calibslam_msgs_py import bags
 from calibslam_msgs_py.bags import BagReader, BagWriter
 from calibslam_msgs_py.conversions import boxes_from_msg, header_to_msg, stamp_from_msg
 from calibslam_msgs_py.measurements import Boxes
 from calibslam_sim import simulate, topics
-from calibslam_sim.coco_writer import CLASSES
+from calibslam_sim.rendering.coco_writer import CLASSES
 
 TIMES, IMAGE_EVERY = 31, 6
 

@@ -14,10 +14,10 @@ from calibslam_msgs.msg import BoundingBoxArray
 from live import Process, Watcher, random_domain, wait_until
 from sensor_msgs.msg import CompressedImage, Image
 
-from calibslam_detector import weights_file
-from calibslam_detector.detector import Detector, DetectorSettings
-from calibslam_detector.image_conversion import decode_compressed
-from calibslam_detector.network import CalibratedDetector
+from calibslam_detector.images.image_conversion import decode_compressed
+from calibslam_detector.model import weights_file
+from calibslam_detector.model.detector import Detector, DetectorSettings
+from calibslam_detector.model.network import CalibratedDetector
 from calibslam_msgs_py.bags import BagReader
 from calibslam_msgs_py.conversions import RosTypes, boxes_from_msg, header_to_msg, stamp_from_msg, valid_boxes
 from calibslam_msgs_py.node import LATCHED, MEASUREMENT, SENSOR

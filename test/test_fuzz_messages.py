@@ -19,8 +19,8 @@ from rclpy.serialization import deserialize_message, serialize_message
 from valid_messages import VALID, WORLD, camera
 
 from calibslam_backend.estimator import Estimator, EstimatorSettings
-from calibslam_detector.calibrator import load
-from calibslam_detector.image_conversion import decode_compressed, decode_raw
+from calibslam_detector.foreign_boxes.calibrator import load
+from calibslam_detector.images.image_conversion import decode_compressed, decode_raw
 from calibslam_msgs_py import bags
 from calibslam_msgs_py import conversions as c
 from calibslam_msgs_py.bag_types import calibslam_typestore

@@ -24,8 +24,8 @@ from rclpy.node import Node
 from rclpy.serialization import serialize_message
 from valid_messages import VALID
 
-from calibslam_detector import weights_file
-from calibslam_detector.network import CalibratedDetector
+from calibslam_detector.model import weights_file
+from calibslam_detector.model.network import CalibratedDetector
 from calibslam_msgs_py.conversions import RosTypes
 from calibslam_msgs_py.settings import SettingsError
 

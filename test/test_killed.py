@@ -22,7 +22,7 @@ from sensor_msgs.msg import CameraInfo
 from small_world import CAMERA, SmallWorld, around, objects
 
 from calibslam_backend.estimator import Estimator, EstimatorSettings
-from calibslam_backend.metrics import Trajectory, ate
+from calibslam_backend.output.metrics import Trajectory, ate
 from calibslam_msgs_py.conversions import (
     RosTypes,
     boxes_to_msg,

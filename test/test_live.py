@@ -19,7 +19,7 @@ from nav_msgs.msg import Path as PathMessage
 from visualization_msgs.msg import MarkerArray
 
 from calibslam_backend import slam_bag
-from calibslam_backend.metrics import Trajectory, ate
+from calibslam_backend.output.metrics import Trajectory, ate
 from calibslam_backend.recording import Recording
 from calibslam_msgs_py.bags import BagReader
 from calibslam_msgs_py.conversions import quadrics_from_msg, stamp_from_msg

@@ -19,7 +19,7 @@ from sensor_msgs.msg import CameraInfo
 from small_world import CAMERA, SmallWorld, around, objects
 from std_srvs.srv import SetBool, Trigger
 
-from calibslam_backend.metrics import ate
+from calibslam_backend.output.metrics import ate
 from calibslam_msgs_py.conversions import RosTypes, boxes_to_msg, camera_to_msg, motion_to_msg
 from calibslam_msgs_py.measurements import SECOND, Boxes, Camera, RelativeMotion
 from calibslam_msgs_py.node import LATCHED

@@ -11,7 +11,7 @@ from live import Process, Watcher, asking_for_kept, keeping_all, random_domain, 
 from nav_msgs.msg import Path as PathMessage
 
 from calibslam_backend import slam_bag
-from calibslam_backend.metrics import ate
+from calibslam_backend.output.metrics import ate
 from calibslam_backend.recording import Recording
 from calibslam_msgs_py.bags import BagReader
 from calibslam_sim import tum_to_bag

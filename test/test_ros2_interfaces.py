@@ -25,8 +25,8 @@ from rcl_interfaces.srv import DescribeParameters, GetParameters, ListParameters
 from rclpy.parameter import parameter_value_to_python
 from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
 
-from calibslam_detector import weights_file
-from calibslam_detector.network import CalibratedDetector
+from calibslam_detector.model import weights_file
+from calibslam_detector.model.network import CalibratedDetector
 from calibslam_msgs_py.parameter_files import NodeParameters
 from calibslam_sim import parameters
 

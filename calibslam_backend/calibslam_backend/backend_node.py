@@ -15,19 +15,19 @@ from pathlib import Path
 
 from rclpy.node import Node
 
-from calibslam_backend.diagnostics import of_session
 from calibslam_backend.estimator import EstimatorSettings
-from calibslam_backend.event_messages_node import TYPES, Decoder
-from calibslam_backend.intake import Kind
-from calibslam_backend.journal import Journal, JournalError
+from calibslam_backend.geometry.transform import transform_from_text
 from calibslam_backend.kernels import load_kernels
-from calibslam_backend.map_publisher_node import MapPublisher
-from calibslam_backend.map_services_node import MapServices
-from calibslam_backend.map_to_odom_node import MapToOdom
-from calibslam_backend.published import POSE, TOPICS, pose_message
-from calibslam_backend.session import NotReady, Session
-from calibslam_backend.session_settings import SessionSettings
-from calibslam_backend.transform import transform_from_text
+from calibslam_backend.output.published import POSE, TOPICS, pose_message
+from calibslam_backend.ros.diagnostics import of_session
+from calibslam_backend.ros.event_messages_node import TYPES, Decoder
+from calibslam_backend.ros.map_publisher_node import MapPublisher
+from calibslam_backend.ros.map_services_node import MapServices
+from calibslam_backend.ros.map_to_odom_node import MapToOdom
+from calibslam_backend.session.intake import Kind
+from calibslam_backend.session.journal import Journal, JournalError
+from calibslam_backend.session.session import NotReady, Session
+from calibslam_backend.session.settings import SessionSettings
 from calibslam_msgs_py.conversions import RosTypes
 from calibslam_msgs_py.measurements import Boxes, InvalidMeasurement, RelativeMotion
 from calibslam_msgs_py.node import (

@@ -13,29 +13,31 @@ What comes out depends on the measurements only, not on when they arrive.
 from __future__ import annotations
 
 import time
-from bisect import insort
 from collections import Counter
 from collections.abc import Callable, Set
-from dataclasses import dataclass
 
 import gtsam
 import numpy as np
 
-from calibslam_backend.assignments import Assignments
-from calibslam_backend.association import GIVEN
-from calibslam_backend.box_measurement import undistorted
-from calibslam_backend.data_association import DataAssociation
+from calibslam_backend.association.assignments import Assignments
+from calibslam_backend.association.data_association import DataAssociation
+from calibslam_backend.association.map_search import MapSearch
+from calibslam_backend.association.matching import GIVEN
+from calibslam_backend.association.relocalisation import FOUND, Relocalised
+from calibslam_backend.association.tracking import Tracker, unique
 from calibslam_backend.estimator_settings import EstimatorSettings
-from calibslam_backend.graph import Motion, ObjectGraph, UpdateReport
+from calibslam_backend.geometry.box_measurement import undistorted
+from calibslam_backend.geometry.ellipsoid import Ellipsoid, covariance_of_pose_and_radii, covariance_of_vector
+from calibslam_backend.graph.measured import Motion
+from calibslam_backend.graph.noise import QUADRICSLAM
+from calibslam_backend.graph.object_graph import ObjectGraph, UpdateReport
 from calibslam_backend.kernels import load_kernels
-from calibslam_backend.new_quadrics import NewQuadrics
-from calibslam_backend.noise import QUADRICSLAM
-from calibslam_backend.object_map import ObjectMap
-from calibslam_backend.odometry import MotionChain
-from calibslam_backend.quadric import Ellipsoid, covariance_of_pose_and_radii, covariance_of_vector
-from calibslam_backend.relocalisation import FOUND, Relocalised
-from calibslam_backend.tracking import Tracker, unique
-from calibslam_backend.upkeep import Upkeep
+from calibslam_backend.keyframe import Keyframe
+from calibslam_backend.objects.new_quadrics import NewQuadrics
+from calibslam_backend.objects.upkeep import Upkeep
+from calibslam_backend.odometry.motion_chain import MotionChain
+from calibslam_backend.odometry.waiting_images import WaitingImages
+from calibslam_backend.output.object_map import ObjectMap
 from calibslam_msgs_py.measurements import (
     SECOND,
     Array,
@@ -47,39 +49,9 @@ from calibslam_msgs_py.measurements import (
 )
 
 
-@dataclass(frozen=True)
-class Keyframe:
-    """What one keyframe brought.
-
-    Attributes:
-        index: its number, from 0.
-        stamp: of its image [ns].
-        T_map_camera: (4, 4) as known right after it.
-        boxes: boxes that were given to quadrics.
-        added, removed: ids of quadrics, since the keyframe before.
-        repaired: what had to be repaired since the keyframe before; "" if nothing.
-        seconds: that it took.
-        between: the longest [s] that an image since the keyframe before took, which is none itself.
-        nis: normalised innovations squared of its boxes, see `innovation`; empty for most keyframes.
-    """
-
-    index: int
-    stamp: int
-    T_map_camera: Array
-    boxes: int
-    added: list[int]
-    removed: list[int]
-    repaired: str
-    seconds: float
-    between: float
-    nis: Array
-
-
 class Estimator:
     """Incremental object SLAM of one camera."""
 
-    SIGHTINGS_APART = SECOND // 5
-    SIGHTINGS_AGREE = 0.2  # [rad, m]
     START_ERROR = 1.0  # [rad, m] of a start pose that is given
     NIS_EVERY = 10  # keyframes, since it takes about as long as half an update's votes
     SETTLE_EVERY = 2  # keyframes
@@ -108,11 +80,9 @@ class Estimator:
         self._repairs: list[str] = []
         self._between = 0.0
         self._chores: list[Callable[[], object]] = []
-        self._searching = False
-        self._sighting: tuple[int, Array] | None = None  # where a camera that searches was seen last
-        self._start: tuple[Array, float] | None = None  # where it is said to be, and how far off that may be
+        self._search = MapSearch(self._objects, self._motions)
         self._given: dict[str, int] = {}
-        self._waiting: list[tuple[int, int, Boxes]] = []
+        self._waiting = WaitingImages(self.camera)
         self._last_frame: int | None = None
 
     # -- measurements in ----------------------------------------------------------------------------------------
@@ -139,20 +109,9 @@ class Estimator:
         """The boxes of an image; returns the keyframes that became possible.
 
         Raises:
-            InvalidMeasurement: "image_size", "late" or "duplicate"; nothing is changed.
+            InvalidMeasurement: see `WaitingImages.add`; nothing is changed.
         """
-        if (boxes.width, boxes.height) != (self.camera.width, self.camera.height):
-            raise InvalidMeasurement(
-                "image_size",
-                f"boxes of a {boxes.width}x{boxes.height} image, but the camera's is "
-                f"{self.camera.width}x{self.camera.height}: do detector and camera_info belong together?",
-            )
-        if self._last_frame is not None and boxes.stamp <= self._last_frame:
-            reason = "duplicate" if boxes.stamp == self._last_frame else "late"
-            raise InvalidMeasurement(reason, f"boxes of {boxes.stamp} ns after those of {self._last_frame} ns")
-        if any(stamp == boxes.stamp for stamp, _, _ in self._waiting):
-            raise InvalidMeasurement("duplicate", f"boxes of {boxes.stamp} ns came twice")
-        insort(self._waiting, (boxes.stamp, len(self._waiting), boxes), key=lambda entry: entry[0])
+        self._waiting.add(boxes, self._last_frame)
         self.counts["images"] += 1
         return self._process()
 
@@ -163,9 +122,7 @@ class Estimator:
 
     def limit_waiting(self, limit: int) -> int:
         """Leave out the latest images that wait for odometry beyond so many; returns how many."""
-        dropped = max(len(self._waiting) - limit, 0)
-        del self._waiting[limit:]
-        return dropped
+        return self._waiting.limit(limit)
 
     def finish(self) -> None:
         """Associate and relinearise until nothing changes any more: the best estimate of all that was seen."""
@@ -258,7 +215,7 @@ class Estimator:
         """Forget everything and start in a known map.
 
         By setting the camera is then where that map was begun, or it is found by the objects it sees: nothing is
-        estimated until two images, at least `SIGHTINGS_APART` apart, agree on where it is.
+        estimated until two images, at least `MapSearch.SIGHTINGS_APART` apart, agree on where it is.
 
         Raises:
             ValueError: a quadric has no covariance.
@@ -267,7 +224,8 @@ class Estimator:
             if not np.isfinite(quadric.covariance).all():
                 raise ValueError(f"quadric {quadric.id} of the map has no covariance")
         self.reset()
-        self._searching = bool(known.quadrics) and self.settings.start_in_map == FOUND
+        if known.quadrics and self.settings.start_in_map == FOUND:
+            self._search.search()
         for quadric in known.quadrics:
             vector = Ellipsoid(quadric.T_map_object, quadric.radii).vector()
             covariance = covariance_of_vector(quadric.T_map_object, quadric.radii, quadric.covariance)
@@ -289,7 +247,7 @@ class Estimator:
             raise InvalidMeasurement("start_pose", "there is no map yet that a start pose could be in")
         if self.stamps:
             self.begin_again(keep_map=True)
-        self._start = T_map_body @ self._T_body_camera, error
+        self._search.expect(T_map_body @ self._T_body_camera, error)
 
     def associations(self) -> list[tuple[int | None, str]]:
         """For each box of a keyframe the quadric it is given to, and its true identity ("": unknown)."""
@@ -307,8 +265,7 @@ class Estimator:
     def _process(self) -> list[Keyframe]:
         keyframes = []
         start, end = self._motions.start, self._motions.end
-        while self._waiting and end is not None and start is not None and self._waiting[0][0] <= end:
-            _, _, boxes = self._waiting.pop(0)
+        while start is not None and end is not None and (boxes := self._waiting.take(end)) is not None:
             if boxes.stamp < start:
                 self.counts["rejected_before_odometry"] += 1
                 continue
@@ -325,10 +282,8 @@ class Estimator:
         self._last_frame = boxes.stamp
         boxes, tracks = self._tracks(boxes, turned)
         motion = found = None
-        if self._start is not None:
-            found, self._start, self._searching = self._near_start(boxes, tracks, *self._start), None, False
-        elif self._searching:
-            found = self._find(boxes, tracks)
+        if self._search.needed:
+            found = self._search.place(boxes.stamp, self._objects.frame(boxes, tracks))
             if found is None:
                 self.counts["images_not_found"] += 1
                 return None
@@ -370,26 +325,6 @@ class Estimator:
             or duration >= s.keyframe_interval * SECOND
         )
 
-    def _find(self, boxes: Boxes, tracks: list[int]) -> Relocalised | None:
-        """Where in the known map the camera is, once two images agree on it."""
-        found, before = self._objects.find(self._objects.frame(boxes, tracks)), self._sighting
-        if found is None:
-            return None
-        if before is not None and boxes.stamp - before[0] < self.SIGHTINGS_APART:
-            return None
-        self._sighting = boxes.stamp, found.T_map_camera
-        motion = np.eye(4)
-        if before is not None:
-            motion = self._motions.motion(before[0], boxes.stamp)
-        self._motions.forget_before(boxes.stamp)
-        if before is None:
-            return None
-        difference = gtsam.Pose3(before[1] @ motion).localCoordinates(gtsam.Pose3(found.T_map_camera))
-        if np.abs(difference).max() > self.SIGHTINGS_AGREE:
-            return None
-        self._searching = False
-        return found
-
     def _chores_of(self, k: int) -> list[Callable[[], object]]:
         """What keyframe k leaves to be done: each a piece of work for one image."""
         objects = self._objects
@@ -418,15 +353,6 @@ class Estimator:
         self._objects.note(report)
         if report.repaired:
             self._repairs.append(report.repaired)
-
-    def _near_start(self, boxes: Boxes, tracks: list[int], start: Array, error: float) -> Relocalised:
-        """Where the camera is found, within `error` of the pose (4, 4) that it is said to have, or that pose."""
-        found = self._objects.find(self._objects.frame(boxes, tracks))
-        if found is not None:
-            difference = gtsam.Pose3(start).localCoordinates(gtsam.Pose3(found.T_map_camera))
-            if np.abs(difference).max() < error:
-                return found
-        return Relocalised(start, [])
 
     def _keyframe(
         self, boxes: Boxes, tracks: list[int], motion: Motion | None, found: Relocalised | None, began: float

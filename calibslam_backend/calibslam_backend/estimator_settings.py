@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from calibslam_backend.association import AssociationSettings
-from calibslam_backend.graph import GraphSettings
-from calibslam_backend.initialisation import InitialisationSettings
-from calibslam_backend.motion_noise import MotionNoise
-from calibslam_backend.noise import NoiseSettings
-from calibslam_backend.relocalisation import RelocalisationSettings
-from calibslam_backend.tracking import TrackingSettings
+from calibslam_backend.association.matching import AssociationSettings
+from calibslam_backend.association.relocalisation import RelocalisationSettings
+from calibslam_backend.association.tracking import TrackingSettings
+from calibslam_backend.graph.noise import NoiseSettings
+from calibslam_backend.graph.object_graph import GraphSettings
+from calibslam_backend.objects.initialisation import InitialisationSettings
+from calibslam_backend.odometry.motion_noise import MotionNoise
 from calibslam_msgs_py.settings import Settings, setting
 
 

@@ -10,15 +10,17 @@ import gtsam
 import numpy as np
 from numba.core.event import Event, Listener, install_listener
 
-from calibslam_backend.box_factor import box_factor, box_tangents
-from calibslam_backend.box_measurement import BoxMeasurement
-from calibslam_backend.initialisation import InitialisationSettings, initialise
-from calibslam_backend.localisation import localise
-from calibslam_backend.quadric import ALL_EDGES, Ellipsoid, box_of_visible_part, shapes
-from calibslam_backend.relocalisation import overlaps_at, scores_at
-from calibslam_backend.revision import squared_distances
-from calibslam_backend.robust import robust_scales
-from calibslam_backend.tracking import overlap
+from calibslam_backend.association.localisation import localise
+from calibslam_backend.association.relocalisation import overlaps_at, scores_at
+from calibslam_backend.association.revision import squared_distances
+from calibslam_backend.association.tracking import overlap
+from calibslam_backend.geometry.box_measurement import BoxMeasurement
+from calibslam_backend.geometry.ellipsoid import Ellipsoid
+from calibslam_backend.geometry.shape import shapes
+from calibslam_backend.geometry.visible_box import ALL_EDGES, box_of_visible_part
+from calibslam_backend.graph.box_factor import box_factor, box_tangents
+from calibslam_backend.graph.robust import robust_scales
+from calibslam_backend.objects.initialisation import InitialisationSettings, initialise
 
 
 class Announcement(Listener):

@@ -12,8 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from calibslam_backend.metrics import Trajectory
-from calibslam_backend.odometry import OdometryDifferencer
+from calibslam_backend.odometry.motion_chain import OdometryDifferencer
+from calibslam_backend.output.metrics import Trajectory
 from calibslam_msgs_py.bags import BagError, BagReader
 from calibslam_msgs_py.conversions import (
     boxes_from_msg,

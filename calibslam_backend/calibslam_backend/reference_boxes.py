@@ -15,12 +15,12 @@ from pathlib import Path
 
 import numpy as np
 
-from calibslam_backend.association import median_overlap, predicted_corners
-from calibslam_backend.box_measurement import BoxMeasurement, prepare
-from calibslam_backend.initialisation import InitialisationSettings, initialise
-from calibslam_backend.metrics import Trajectory, interpolated
+from calibslam_backend.association.matching import median_overlap, predicted_corners
+from calibslam_backend.association.tracking import Tracker, TrackingSettings, unique
+from calibslam_backend.geometry.box_measurement import BoxMeasurement, prepare
+from calibslam_backend.objects.initialisation import InitialisationSettings, initialise
+from calibslam_backend.output.metrics import Trajectory, interpolated
 from calibslam_backend.recording import Recording
-from calibslam_backend.tracking import Tracker, TrackingSettings, unique
 from calibslam_msgs_py.bags import BagError
 from calibslam_msgs_py.measurements import Array, Boxes, Camera
 from calibslam_msgs_py.settings import setting

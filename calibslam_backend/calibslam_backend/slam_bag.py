@@ -12,12 +12,13 @@ from pathlib import Path
 
 import numpy as np
 
-from calibslam_backend.estimator import Estimator, EstimatorSettings, Keyframe
-from calibslam_backend.object_map import ObjectMap
-from calibslam_backend.published import POSE, TRANSFORM, camera_transform_message, map_messages, pose_message
+from calibslam_backend.estimator import Estimator, EstimatorSettings
+from calibslam_backend.geometry.transform import transform_from_text
+from calibslam_backend.keyframe import Keyframe
+from calibslam_backend.output.object_map import ObjectMap
+from calibslam_backend.output.published import POSE, TRANSFORM, camera_transform_message, map_messages, pose_message
+from calibslam_backend.output.run_folder import RunRecord, write_run
 from calibslam_backend.recording import Recording
-from calibslam_backend.run_folder import RunRecord, write_run
-from calibslam_backend.transform import transform_from_text
 from calibslam_msgs_py import bags
 from calibslam_msgs_py.bags import BagError, BagReader, BagWriter
 from calibslam_msgs_py.command import command

@@ -11,7 +11,7 @@ import pytest
 from scipy.stats import chi2
 from small_world import CAMERA, around, objects
 
-from calibslam_backend.association import (
+from calibslam_backend.association.matching import (
     SIZE_RATIO,
     AssociationSettings,
     Prediction,
@@ -25,8 +25,9 @@ from calibslam_backend.association import (
     same_object,
     unambiguous,
 )
-from calibslam_backend.box_measurement import BoxMeasurement
-from calibslam_backend.quadric import ALL_EDGES, Ellipsoid, box_of_visible_part, image_bounds
+from calibslam_backend.geometry.box_measurement import BoxMeasurement
+from calibslam_backend.geometry.ellipsoid import Ellipsoid
+from calibslam_backend.geometry.visible_box import ALL_EDGES, box_of_visible_part, image_bounds
 from calibslam_msgs_py.measurements import Array
 
 BOUNDS = image_bounds(CAMERA.width, CAMERA.height)

@@ -11,10 +11,10 @@ from hypothesis import strategies as st
 from scipy import stats
 from small_world import CAMERA, SmallWorld, around, objects
 
-from calibslam_backend.association import GIVEN
-from calibslam_backend.box_correlation import FASTEST, BoxCorrelation, crossover, slow_part, spectrum
+from calibslam_backend.association.matching import GIVEN
 from calibslam_backend.estimator import Estimator, EstimatorSettings
-from calibslam_backend.metrics import Trajectory, position_nees
+from calibslam_backend.graph.box_correlation import FASTEST, BoxCorrelation, crossover, slow_part, spectrum
+from calibslam_backend.output.metrics import Trajectory, position_nees
 from calibslam_msgs_py.measurements import Array
 
 

@@ -9,10 +9,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numerical import assert_jacobians
 
-from calibslam_backend.box_correlation import BoxCorrelation
-from calibslam_backend.box_factor import INVISIBLE, box_factor, box_tangents, pose_information, whitened_residual
-from calibslam_backend.box_measurement import BoxMeasurement
-from calibslam_backend.quadric import ALL_EDGES, Ellipsoid, box_of_visible_part, image_bounds
+from calibslam_backend.geometry.box_measurement import BoxMeasurement
+from calibslam_backend.geometry.ellipsoid import Ellipsoid
+from calibslam_backend.geometry.visible_box import ALL_EDGES, box_of_visible_part, image_bounds
+from calibslam_backend.graph.box_correlation import BoxCorrelation
+from calibslam_backend.graph.box_factor import INVISIBLE, box_factor, box_tangents, pose_information, whitened_residual
 from calibslam_msgs_py.measurements import Array
 
 K = np.array([[520.0, 0.0, 320.0], [0.0, 510.0, 240.0], [0.0, 0.0, 1.0]])

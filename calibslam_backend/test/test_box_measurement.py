@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from calibslam_backend.box_measurement import BORDER, BORDER_SIGMAS, prepare, undistorted
+from calibslam_backend.geometry.box_measurement import BORDER, BORDER_SIGMAS, prepare, undistorted
 from calibslam_msgs_py.measurements import Array, Boxes, Camera
 
 # TUM fr1, as published by its authors.

@@ -9,10 +9,10 @@ import numpy as np
 from scipy.stats import chi2
 from small_world import CAMERA, SmallWorld, around, objects
 
-from calibslam_backend import metrics
-from calibslam_backend.association import GIVEN
+from calibslam_backend.association.matching import GIVEN
 from calibslam_backend.estimator import Estimator, EstimatorSettings
-from calibslam_backend.graph import _D
+from calibslam_backend.graph.keys import D
+from calibslam_backend.output import metrics
 from calibslam_msgs_py.measurements import SECOND, Array, RelativeMotion
 
 WORLD = SmallWorld(around(240, turn=2.0 * np.pi), objects())
@@ -67,7 +67,7 @@ def test_a_constant_drift_is_found() -> None:
     for seed in range(RUNS):
         drift = SIGMAS * np.random.default_rng(seed).normal(size=6)
         estimator = run(replace(WORLD, seed=seed), drift, SIGMAS)
-        found, covariance = estimator._graph.drift(), estimator._graph._smoother.marginal(_D)
+        found, covariance = estimator._graph.drift(), estimator._graph._smoother.marginal(D)
         squared.append(float((found - drift) @ np.linalg.solve(covariance, found - drift)))
         assert (np.delete(np.sqrt(np.diag(covariance)) / SIGMAS, ALONG) < 0.5).all()
     low, high = chi2.interval(0.999, 6 * RUNS)
@@ -84,7 +84,7 @@ def test_a_drift_that_is_estimated_does_not_bend_the_trajectory() -> None:
 
 def test_without_drift_none_is_found() -> None:
     estimator = run(WORLD, np.zeros(6), SIGMAS)
-    covariance = estimator._graph._smoother.marginal(_D)
+    covariance = estimator._graph._smoother.marginal(D)
     found = estimator._graph.drift()
     assert found @ np.linalg.solve(covariance, found) < chi2.ppf(0.999, 6)
 

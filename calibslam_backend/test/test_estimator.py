@@ -12,13 +12,14 @@ import numpy as np
 import pytest
 from small_world import CAMERA, SECOND, SmallWorld, around, objects
 
-from calibslam_backend import metrics
-from calibslam_backend.association import ESTIMATED, GIVEN
-from calibslam_backend.estimator import Estimator, EstimatorSettings, Keyframe
-from calibslam_backend.graph import T_MAP_FIRST_CAMERA, ObjectGraph
-from calibslam_backend.noise import FIXED, QUADRICSLAM
-from calibslam_backend.object_map import ObjectMap, tum_lines
-from calibslam_backend.quadric import Ellipsoid
+from calibslam_backend.association.matching import ESTIMATED, GIVEN
+from calibslam_backend.estimator import Estimator, EstimatorSettings
+from calibslam_backend.geometry.ellipsoid import Ellipsoid
+from calibslam_backend.graph.noise import FIXED, QUADRICSLAM
+from calibslam_backend.graph.object_graph import T_MAP_FIRST_CAMERA, ObjectGraph
+from calibslam_backend.keyframe import Keyframe
+from calibslam_backend.output import metrics
+from calibslam_backend.output.object_map import ObjectMap, tum_lines
 from calibslam_msgs_py.measurements import Boxes, InvalidMeasurement, RelativeMotion
 
 ONCE_AROUND = SmallWorld(around(240, turn=2.0 * np.pi), objects())
@@ -355,7 +356,7 @@ def test_quadrics_that_run_away_are_taken_out_and_found_again(monkeypatch: pytes
     feed(e, measurements[:250])
     before = {q.id for q in e.quadrics()}
     assert len(before) >= 8
-    monkeypatch.setattr(ObjectGraph, "LARGEST_DISTANCE", 0.01)
+    monkeypatch.setattr("calibslam_backend.graph.plausible.LARGEST_DISTANCE", 0.01)
     rest = iter(measurements[250:])
     removed: list[int] = []
     while not removed:

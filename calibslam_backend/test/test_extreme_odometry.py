@@ -9,7 +9,7 @@ import pytest
 from small_world import CAMERA, SmallWorld, around, objects
 
 from calibslam_backend.estimator import Estimator, EstimatorSettings
-from calibslam_backend.metrics import Trajectory, ate
+from calibslam_backend.output.metrics import Trajectory, ate
 from calibslam_msgs_py.measurements import Boxes, RelativeMotion
 
 WORLD = SmallWorld(around(60), objects())

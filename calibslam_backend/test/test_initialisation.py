@@ -10,16 +10,15 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2, ttest_1samp
 from small_world import CAMERA, around, looking_at, objects
 
-from calibslam_backend import box_measurement
-from calibslam_backend.box_measurement import BoxMeasurement, prepare
-from calibslam_backend.initialisation import InitialisationSettings, Initialised, initialise, initialise_by_newest
-from calibslam_backend.quadric import (
-    ALL_EDGES,
-    Ellipsoid,
-    box_of_visible_part,
-    image_bounds,
-    matrix_from_vector,
-    vector_from_matrix,
+from calibslam_backend.geometry import box_measurement
+from calibslam_backend.geometry.box_measurement import BoxMeasurement, prepare
+from calibslam_backend.geometry.ellipsoid import Ellipsoid, matrix_from_vector, vector_from_matrix
+from calibslam_backend.geometry.visible_box import ALL_EDGES, box_of_visible_part, image_bounds
+from calibslam_backend.objects.initialisation import (
+    InitialisationSettings,
+    Initialised,
+    initialise,
+    initialise_by_newest,
 )
 from calibslam_msgs_py.measurements import Array, Boxes
 

@@ -7,11 +7,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from calibslam_backend import joining
-from calibslam_backend.box_measurement import BoxMeasurement
-from calibslam_backend.initialisation import InitialisationSettings
-from calibslam_backend.joining import Glimpse, Joined, join, rays_meet
-from calibslam_backend.quadric import ALL_EDGES, Ellipsoid, box_of_visible_part, image_bounds
+from calibslam_backend.geometry.box_measurement import BoxMeasurement
+from calibslam_backend.geometry.ellipsoid import Ellipsoid
+from calibslam_backend.geometry.visible_box import ALL_EDGES, box_of_visible_part, image_bounds
+from calibslam_backend.objects import joining
+from calibslam_backend.objects.initialisation import InitialisationSettings
+from calibslam_backend.objects.joining import Glimpse, Joined, join, rays_meet
 from calibslam_msgs_py.measurements import Array
 
 K = np.array([[500.0, 0.0, 320.0], [0.0, 500.0, 240.0], [0.0, 0.0, 1.0]])

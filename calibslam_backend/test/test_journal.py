@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from calibslam_backend.journal import MAGIC, Journal, JournalError, Record
+from calibslam_backend.session.journal import MAGIC, Journal, JournalError, Record
 
 RECORDS = [Record(1, b"camera"), Record(2, b""), Record(3, bytes(range(256)) * 20), Record(7, b"\0" * 9)]
 HEADER = 9  # bytes before each payload

@@ -11,7 +11,7 @@ import pytest
 from numba.core.event import install_listener
 from small_world import CAMERA, SmallWorld, around, objects
 
-from calibslam_backend.association import ESTIMATED
+from calibslam_backend.association.matching import ESTIMATED
 from calibslam_backend.estimator import Estimator, EstimatorSettings
 from calibslam_backend.kernels import Announcement, load_kernels
 
@@ -37,7 +37,7 @@ def test_a_run_compiles_nothing() -> None:
         estimator.add(measurement)
     estimator.finish()
     assert estimator.objects
-    assert before["calibslam_backend.revision.squared_distances"]
+    assert before["calibslam_backend.association.revision.squared_distances"]
     assert compiled() == before
 
 

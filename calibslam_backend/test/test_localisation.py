@@ -8,10 +8,10 @@ import gtsam
 import numpy as np
 from small_world import CAMERA, SmallWorld, around, objects
 
-from calibslam_backend.box_factor import INVISIBLE, whitened_residual
-from calibslam_backend.box_measurement import BoxMeasurement, prepare
-from calibslam_backend.localisation import localise
-from calibslam_backend.robust import robust_loss
+from calibslam_backend.association.localisation import localise
+from calibslam_backend.geometry.box_measurement import BoxMeasurement, prepare
+from calibslam_backend.graph.box_factor import INVISIBLE, whitened_residual
+from calibslam_backend.graph.robust import robust_loss
 from calibslam_msgs_py.measurements import Array
 
 POSES = around(10)

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from calibslam_backend.map_folder import PathRefused, confined
+from calibslam_backend.output.map_folder import PathRefused, confined
 
 
 @pytest.mark.parametrize("path", ["map.json", "a/b/map.json", "a/../map.json", "./map.json", "ABSOLUTE/map.json"])

@@ -8,8 +8,8 @@ from typing import Any
 
 import pytest
 
-from calibslam_backend import map_publisher_node
-from calibslam_backend.map_publisher_node import MapPublisher
+from calibslam_backend.ros import map_publisher_node
+from calibslam_backend.ros.map_publisher_node import MapPublisher
 
 
 class Queue:

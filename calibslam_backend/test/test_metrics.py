@@ -6,7 +6,7 @@ import gtsam
 import numpy as np
 import pytest
 
-from calibslam_backend.metrics import (
+from calibslam_backend.output.metrics import (
     NoGroundTruth,
     Trajectory,
     alignment,

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from small_map import FRAMES, LEFT, RIGHT, World
 
-from calibslam_backend import data_association
-from calibslam_backend.assignments import Assignments
-from calibslam_backend.association import GIVEN
-from calibslam_backend.new_quadrics import NewQuadrics
-from calibslam_backend.relocalisation import Relocalised
+from calibslam_backend.association import data_association
+from calibslam_backend.association.assignments import Assignments
+from calibslam_backend.association.matching import GIVEN
+from calibslam_backend.association.relocalisation import Relocalised
+from calibslam_backend.objects.new_quadrics import NewQuadrics
 
 
 def flickering(**settings: str) -> World:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from calibslam_backend.noise import (
+from calibslam_backend.graph.noise import (
     CALIBRATED,
     FIXED,
     LEAST_SPREAD,

@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 from evo.tools import file_interface
 
-from calibslam_backend.object_map import MapFileError, ObjectMap, tum_lines
-from calibslam_backend.transform import transform_from_text
+from calibslam_backend.geometry.transform import transform_from_text
+from calibslam_backend.output.object_map import MapFileError, ObjectMap, tum_lines
 from calibslam_msgs_py.measurements import Array, QuadricEstimate
 
 STAMPS = (1_305_031_102_175_304_001, 1_305_031_103_000_000_000, 1_305_031_104_999_999_999)

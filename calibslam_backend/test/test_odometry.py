@@ -10,8 +10,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from calibslam_backend.motion_noise import MotionNoise
-from calibslam_backend.odometry import MotionChain, OdometryDifferencer
+from calibslam_backend.odometry.motion_chain import MotionChain, OdometryDifferencer
+from calibslam_backend.odometry.motion_noise import MotionNoise
 from calibslam_msgs_py.measurements import SECOND, Array, InvalidMeasurement, RelativeMotion
 
 T0 = 5 * SECOND

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numerical import assert_jacobians
 
-from calibslam_backend.odometry_factor import motion_factor
+from calibslam_backend.graph.odometry_factor import motion_factor
 from calibslam_msgs_py.measurements import Array
 
 START, END, DRIFT = 0, 1, 2

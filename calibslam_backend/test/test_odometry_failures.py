@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from scipy.stats import chi2, multivariate_normal
 
-from calibslam_backend.odometry_failures import BelievedStep, FailureFilter, FailureSettings
+from calibslam_backend.odometry.failures import BelievedStep, FailureFilter, FailureSettings
 from calibslam_msgs_py.measurements import Array
 
 STEP = 1.0 / 30.0  # [s]

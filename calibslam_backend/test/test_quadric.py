@@ -10,21 +10,22 @@ from hypothesis import strategies as st
 from numerical import assert_jacobians
 from scipy.spatial.transform import Rotation
 
-from calibslam_backend.quadric import (
+from calibslam_backend.geometry.ellipsoid import (
+    Ellipsoid,
+    covariance_of_pose_and_radii,
+    covariance_of_vector,
+    matrix_from_vector,
+    vector_from_matrix,
+)
+from calibslam_backend.geometry.shape import _eigen, shapes
+from calibslam_backend.geometry.visible_box import (
     ALL_EDGES,
     POSE,
     QUADRIC,
     UNBOUNDED,
-    Ellipsoid,
-    _eigen,
     box_of_visible_part,
-    covariance_of_pose_and_radii,
-    covariance_of_vector,
     image_bounds,
-    matrix_from_vector,
     project,
-    shapes,
-    vector_from_matrix,
 )
 from calibslam_msgs_py.measurements import Array
 

@@ -10,7 +10,7 @@ import pytest
 from small_bag import messages, write
 from small_world import CAMERA, SmallWorld, around, objects
 
-from calibslam_backend.metrics import Trajectory
+from calibslam_backend.output.metrics import Trajectory
 from calibslam_backend.reference_boxes import NONE, Referenced, ReferenceSettings, of_recording, reference
 from calibslam_msgs_py.bags import BagError
 from calibslam_msgs_py.measurements import SECOND, Array, Boxes

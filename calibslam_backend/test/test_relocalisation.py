@@ -5,10 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from calibslam_backend.box_measurement import BoxMeasurement
+from calibslam_backend.association.relocalisation import RelocalisationSettings, Relocalised, overlaps_at, relocalise
+from calibslam_backend.geometry.box_measurement import BoxMeasurement
+from calibslam_backend.geometry.ellipsoid import Ellipsoid
+from calibslam_backend.geometry.visible_box import ALL_EDGES, box_of_visible_part, image_bounds
 from calibslam_backend.kernels import load_kernels
-from calibslam_backend.quadric import ALL_EDGES, Ellipsoid, box_of_visible_part, image_bounds
-from calibslam_backend.relocalisation import RelocalisationSettings, Relocalised, overlaps_at, relocalise
 from calibslam_msgs_py.measurements import Array
 
 K = np.array([[500.0, 0.0, 320.0], [0.0, 500.0, 240.0], [0.0, 0.0, 1.0]])

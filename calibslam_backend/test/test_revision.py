@@ -10,9 +10,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from calibslam_backend.association import AssociationSettings, class_costs
-from calibslam_backend.quadric import ALL_EDGES, Ellipsoid, box_of_visible_part, image_bounds, shapes
-from calibslam_backend.revision import COHERENCE, REACH, SPAN, Evidence, Revision, squared_distances
+from calibslam_backend.association.matching import AssociationSettings, class_costs
+from calibslam_backend.association.revision import COHERENCE, REACH, SPAN, Evidence, Revision, squared_distances
+from calibslam_backend.geometry.ellipsoid import Ellipsoid
+from calibslam_backend.geometry.shape import shapes
+from calibslam_backend.geometry.visible_box import ALL_EDGES, box_of_visible_part, image_bounds
 from calibslam_msgs_py.measurements import Array
 
 K = np.array([[500.0, 0.0, 320.0], [0.0, 500.0, 240.0], [0.0, 0.0, 1.0]])

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from calibslam_backend.robust import robust_loss, robust_scales
+from calibslam_backend.graph.robust import robust_loss, robust_scales
 
 scales = st.floats(0.1, 100.0)
 

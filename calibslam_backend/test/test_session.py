@@ -15,13 +15,13 @@ import numpy as np
 import pytest
 from small_world import CAMERA, SmallWorld, around, objects
 
-from calibslam_backend.diagnostics import state
 from calibslam_backend.estimator import EstimatorSettings
-from calibslam_backend.intake import Event, Kind
-from calibslam_backend.journal import Journal, Record
-from calibslam_backend.metrics import Trajectory, ate
-from calibslam_backend.session import NotReady, Session
-from calibslam_backend.session_settings import SessionSettings
+from calibslam_backend.output.metrics import Trajectory, ate
+from calibslam_backend.ros.diagnostics import state
+from calibslam_backend.session.intake import Event, Kind
+from calibslam_backend.session.journal import Journal, Record
+from calibslam_backend.session.session import NotReady, Session
+from calibslam_backend.session.settings import SessionSettings
 from calibslam_msgs_py.measurements import Array, Boxes, InvalidMeasurement, RelativeMotion, StampedPose
 
 WORLD = SmallWorld(around(120), objects())

@@ -16,7 +16,7 @@ from rosbags.rosbag2 import StoragePlugin, Writer
 from small_bag import WORLD, Message, messages, write
 
 from calibslam_backend import slam_bag
-from calibslam_backend.object_map import ObjectMap
+from calibslam_backend.output.object_map import ObjectMap
 from calibslam_msgs_py import bags
 from calibslam_msgs_py import conversions as c
 from calibslam_msgs_py.bags import BagReader

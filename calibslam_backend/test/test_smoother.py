@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from gtsam import symbol
 
-from calibslam_backend.smoother import Smoother
+from calibslam_backend.graph.smoother import Smoother
 from calibslam_msgs_py.measurements import Array
 
 X = [int(symbol("x", k)) for k in range(6)]

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 import pytest
 
-from calibslam_backend.time_guard import KEEP_MAP, REJECT, RESET, Measurement, TimeGuard, TimeSettings
+from calibslam_backend.session.time_guard import KEEP_MAP, REJECT, RESET, Measurement, TimeGuard, TimeSettings
 from calibslam_msgs_py.measurements import SECOND, Boxes, InvalidMeasurement, RelativeMotion
 
 RATE = 30

@@ -6,7 +6,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 from small_world import CAMERA
 
-from calibslam_backend.tracking import Tracker, TrackingSettings, overlap, rotated, unique
+from calibslam_backend.association.tracking import Tracker, TrackingSettings, overlap, rotated, unique
 from calibslam_msgs_py.measurements import SECOND
 
 A = np.array([100.0, 100.0, 200.0, 200.0])

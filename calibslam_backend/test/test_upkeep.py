@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 from small_map import FRAMES, LEFT, RIGHT, World
 
-from calibslam_backend.association import GIVEN
+from calibslam_backend.association.matching import GIVEN
 
 # Nearer to the left one than 0.7 of their radii's sum. Its box of 30 px is 12 px away (overlap 0.4), 20 px (0.2), and
 # behind it hardly smaller.

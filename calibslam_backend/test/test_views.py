@@ -9,7 +9,7 @@ from typing import Any
 
 import yaml
 
-from calibslam_backend.published import MAP, MARKERS, POSE, QUADRICS, TOPICS, TRAJECTORY
+from calibslam_backend.output.published import MAP, MARKERS, POSE, QUADRICS, TOPICS, TRAJECTORY
 
 PACKAGE = Path(__file__).resolve().parents[1]
 OVERLAY, DIAGNOSTICS, INITIAL_POSE = "detector/overlay/compressed", "diagnostics", "initialpose"

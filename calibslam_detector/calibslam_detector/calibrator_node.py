@@ -14,7 +14,7 @@ from typing import Any
 from calibslam_msgs.msg import BoundingBoxArray
 from rclpy.node import Node
 
-from calibslam_detector.calibrator import CalibratorError, load
+from calibslam_detector.foreign_boxes.calibrator import CalibratorError, load
 from calibslam_msgs_py.conversions import RosTypes, boxes_from_msg, boxes_to_msg, valid_boxes
 from calibslam_msgs_py.measurements import InvalidMeasurement
 from calibslam_msgs_py.node import MEASUREMENT, MEASUREMENT_INPUT, Counters, advertise, run, subscribe

@@ -18,10 +18,10 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
-from calibslam_detector.detector import Detector, DetectorSettings, DeviceError
-from calibslam_detector.image_conversion import OVERLAY_QUALITY, decode_image, encode_jpeg
-from calibslam_detector.overlay import draw_overlay
-from calibslam_detector.weights_file import SHIPPED, WeightsError
+from calibslam_detector.images.image_conversion import OVERLAY_QUALITY, decode_image, encode_jpeg
+from calibslam_detector.images.overlay import draw_overlay
+from calibslam_detector.model.detector import Detector, DetectorSettings, DeviceError
+from calibslam_detector.model.weights_file import SHIPPED, WeightsError
 from calibslam_msgs_py import bags
 from calibslam_msgs_py.bags import BagError, BagReader, BagWriter
 from calibslam_msgs_py.command import command

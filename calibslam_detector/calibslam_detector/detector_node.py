@@ -20,10 +20,10 @@ from calibslam_msgs.msg import BoundingBoxArray
 from rclpy.node import Node
 from sensor_msgs.msg import CompressedImage, Image
 
-from calibslam_detector.detector import Detector, DetectorSettings, DeviceError
-from calibslam_detector.image_conversion import OVERLAY_QUALITY, decode_image, encode_jpeg
-from calibslam_detector.overlay import draw_overlay
-from calibslam_detector.weights_file import SHIPPED, WeightsError
+from calibslam_detector.images.image_conversion import OVERLAY_QUALITY, decode_image, encode_jpeg
+from calibslam_detector.images.overlay import draw_overlay
+from calibslam_detector.model.detector import Detector, DetectorSettings, DeviceError
+from calibslam_detector.model.weights_file import SHIPPED, WeightsError
 from calibslam_msgs_py.conversions import RosTypes, boxes_to_msg, header_to_msg, stamp_from_msg, valid_boxes
 from calibslam_msgs_py.node import MEASUREMENT, SECONDS_BETWEEN_WARNINGS, SENSOR, Counters, advertise, run
 from calibslam_msgs_py.node_sensors import SensorSubscription

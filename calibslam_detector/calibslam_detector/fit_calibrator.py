@@ -19,10 +19,10 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from calibslam_detector.calibration.metrics import coverage
-from calibslam_detector.calibrator import FILE_VERSION, CalibratorError
-from calibslam_detector.calibrator_features import FEATURES, edge_features
-from calibslam_detector.edge_mixture import EdgeMixture, fit_mixture
-from calibslam_detector.log_linear_calibrator import LogLinearCalibrator
+from calibslam_detector.foreign_boxes.calibrator import FILE_VERSION, CalibratorError
+from calibslam_detector.foreign_boxes.edge_mixture import EdgeMixture, fit_mixture
+from calibslam_detector.foreign_boxes.features import FEATURES, edge_features
+from calibslam_detector.foreign_boxes.log_linear import LogLinearCalibrator
 from calibslam_msgs_py.bags import BagError
 from calibslam_msgs_py.command import command
 from calibslam_msgs_py.measurements import Array, Boxes

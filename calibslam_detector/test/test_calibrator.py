@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from calibslam_detector.calibrator import CalibratorError, PerSizeCalibrator, load
+from calibslam_detector.foreign_boxes.calibrator import CalibratorError, PerSizeCalibrator, load
 from calibslam_msgs_py.measurements import Boxes
 
 

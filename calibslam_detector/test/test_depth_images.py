@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from calibslam_detector.image_conversion import decode_compressed_depth, decode_depth
+from calibslam_detector.images.image_conversion import decode_compressed_depth, decode_depth
 from calibslam_msgs_py.measurements import InvalidMeasurement
 
 DEPTH = np.array([[0, 1000, 2500], [65535, 1, 4000]], np.uint16)  # [mm]

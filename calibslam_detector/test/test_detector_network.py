@@ -10,17 +10,17 @@ from hypothesis import strategies as st
 from torch.autograd.functional import jacobian
 from torchvision.models.detection._utils import BoxCoder
 
-from calibslam_detector.box_covariance import (
+from calibslam_detector.model.box_covariance import (
     corner_covariances,
     coupling_matrix,
     decoder_jacobian,
     decoupled,
     rescaled,
 )
-from calibslam_detector.covariance_head import MAX_COUPLING, VARIANCE_BOUNDS, CovarianceHead
-from calibslam_detector.familiarity import Familiarity, descriptor
-from calibslam_detector.network import ARCHITECTURES, CalibratedDetector, freeze_norms
-from calibslam_detector.region_cues import CUES
+from calibslam_detector.model.covariance_head import MAX_COUPLING, VARIANCE_BOUNDS, CovarianceHead
+from calibslam_detector.model.familiarity import Familiarity, descriptor
+from calibslam_detector.model.network import ARCHITECTURES, CalibratedDetector, freeze_norms
+from calibslam_detector.model.region_cues import CUES
 
 CODER = BoxCoder((10.0, 10.0, 5.0, 5.0))
 CLASSES = ("cup", "book", "chair")

@@ -15,13 +15,14 @@ import numpy as np
 import pytest
 import torch
 
-from calibslam_detector import evaluate_detector, train, weights_file
-from calibslam_detector.coco_data import DataError, TrainingImages, load_coco_data
-from calibslam_detector.covariance_task import LOSSES, Examples, covariance_task
-from calibslam_detector.network import CalibratedDetector
-from calibslam_detector.region_cues import CUES
-from calibslam_detector.training_loop import LoopSettings, Task, TrainingError, batch_of, optimise
-from calibslam_detector.weights_file import WeightsError
+from calibslam_detector import evaluate_detector, train
+from calibslam_detector.model import weights_file
+from calibslam_detector.model.network import CalibratedDetector
+from calibslam_detector.model.region_cues import CUES
+from calibslam_detector.model.weights_file import WeightsError
+from calibslam_detector.training.coco_data import DataError, TrainingImages, load_coco_data
+from calibslam_detector.training.covariance_task import LOSSES, Examples, covariance_task
+from calibslam_detector.training.training_loop import LoopSettings, Task, TrainingError, batch_of, optimise
 
 COLOURS = {"cup": (40, 40, 220), "book": (220, 60, 40)}
 FAST = ["--batch", "2", "--log-every", "1", "--warm-up", "0"]
@@ -287,7 +288,7 @@ def test_both_stages_and_evaluation(data: Path, tmp_path: Path, monkeypatch: pyt
     torch.manual_seed(1)
     model = CalibratedDetector("compact", tuple(COLOURS))
     weights_file.save(model, tmp_path / "begin.pt")
-    monkeypatch.setattr("calibslam_detector.matching.MIN_OVERLAP", 0.02)
+    monkeypatch.setattr("calibslam_detector.training.matching.MIN_OVERLAP", 0.02)
     monkeypatch.setattr(train, "MIN_EXAMPLES", 2)
     options = ["--stage", "covariance", "--weights", str(tmp_path / "begin.pt"), "--loss", "nll", "--steps", "3"]
     out = tmp_path / "run"

@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 from small_bag import messages, write
 
-from calibslam_detector.calibrator import CalibratorError, load
-from calibslam_detector.calibrator_features import FEATURES, edge_features
-from calibslam_detector.edge_mixture import EdgeMixture, fit_mixture
 from calibslam_detector.fit_calibrator import Edges, calibrator, fit, held_out, judge, main
-from calibslam_detector.log_linear_calibrator import LogLinearCalibrator
+from calibslam_detector.foreign_boxes.calibrator import CalibratorError, load
+from calibslam_detector.foreign_boxes.edge_mixture import EdgeMixture, fit_mixture
+from calibslam_detector.foreign_boxes.features import FEATURES, edge_features
+from calibslam_detector.foreign_boxes.log_linear import LogLinearCalibrator
 from calibslam_msgs_py.measurements import Array, Boxes
 
 

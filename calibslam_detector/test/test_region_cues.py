@@ -7,7 +7,7 @@ import math
 import pytest
 import torch
 
-from calibslam_detector.region_cues import (
+from calibslam_detector.model.region_cues import (
     AGREEMENT,
     GEOMETRY,
     HIDING,

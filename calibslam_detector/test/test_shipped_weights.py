@@ -11,8 +11,8 @@ import pytest
 import setuptools
 import torch
 
-from calibslam_detector import weights_file
-from calibslam_detector.detector import Detector, DetectorSettings
+from calibslam_detector.model import weights_file
+from calibslam_detector.model.detector import Detector, DetectorSettings
 from calibslam_msgs_py.conversions import valid_boxes
 
 MOST_BYTES = 25e6

@@ -20,15 +20,15 @@ from pathlib import Path
 from typing import Any
 
 from calibslam_backend.kernels import load_kernels
-from calibslam_backend.object_map import ObjectMap
+from calibslam_backend.output.object_map import ObjectMap
 from calibslam_msgs_py.bags import BagError, BagReader
 from calibslam_msgs_py.command import command
 from calibslam_sim import demo_images, topics
+from calibslam_sim.accuracy.reference import read_reference
 from calibslam_sim.evaluate import evaluate
 from calibslam_sim.processes import POLL, ProcessFailed, ProcessGroup
 from calibslam_sim.progress import Progress
-from calibslam_sim.reference import read_reference
-from calibslam_sim.simulation import SCENARIOS, SimulationSettings
+from calibslam_sim.simulation.recording import SCENARIOS, SimulationSettings
 
 START_TIMEOUT = 180.0  # [s] for all nodes to be there
 SAVE_TIMEOUT = 120.0  # [s]

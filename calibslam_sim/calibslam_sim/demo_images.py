@@ -7,17 +7,17 @@ from pathlib import Path
 import cv2
 
 from calibslam_detector.detect_bag import DetectBagSettings, detect_bag
-from calibslam_detector.detector import Detector, DetectorSettings
-from calibslam_detector.image_conversion import decode_image
-from calibslam_detector.overlay import draw_overlay
-from calibslam_detector.weights_file import SHIPPED
+from calibslam_detector.images.image_conversion import decode_image
+from calibslam_detector.images.overlay import draw_overlay
+from calibslam_detector.model.detector import Detector, DetectorSettings
+from calibslam_detector.model.weights_file import SHIPPED
 from calibslam_msgs_py.bags import BagReader
 from calibslam_msgs_py.conversions import boxes_from_msg, stamp_from_msg
 from calibslam_sim import topics
-from calibslam_sim.render import Renderer
-from calibslam_sim.render_looks import FAMILIES
+from calibslam_sim.rendering.looks import FAMILIES
+from calibslam_sim.rendering.render import Renderer
 from calibslam_sim.simulate import write_bag
-from calibslam_sim.simulation import SimulationSettings, simulate
+from calibslam_sim.simulation.recording import SimulationSettings, simulate
 
 DETECTED = "/detections_from_images"
 IMAGE_EVERY = 6  # of the simulated times: at 30 Hz five images per second, several for each keyframe

@@ -14,10 +14,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from calibslam_backend.object_map import MapFileError, ObjectMap
+from calibslam_backend.output.object_map import MapFileError, ObjectMap
 from calibslam_backend.recording import Recording
-from calibslam_detector.image_conversion import decode_image, encode_jpeg
-from calibslam_detector.overlay import class_colour, draw_overlay
+from calibslam_detector.images.image_conversion import decode_image, encode_jpeg
+from calibslam_detector.images.overlay import class_colour, draw_overlay
 from calibslam_msgs_py.bags import BagError, BagReader
 from calibslam_msgs_py.command import command
 from calibslam_msgs_py.conversions import stamp_from_msg

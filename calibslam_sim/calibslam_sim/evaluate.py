@@ -16,17 +16,17 @@ from typing import Any
 
 import numpy as np
 
-from calibslam_backend.metrics import NoGroundTruth, Trajectory, alignment
-from calibslam_backend.motion_noise import MotionNoise
-from calibslam_backend.object_map import MapFileError, ObjectMap, tum_lines
-from calibslam_backend.odometry import MotionChain, dead_reckoning
-from calibslam_backend.plots import plot_run
-from calibslam_backend.quadric import Ellipsoid
-from calibslam_backend.run_folder import accuracy
+from calibslam_backend.geometry.ellipsoid import Ellipsoid
+from calibslam_backend.odometry.motion_chain import MotionChain, dead_reckoning
+from calibslam_backend.odometry.motion_noise import MotionNoise
+from calibslam_backend.output.metrics import NoGroundTruth, Trajectory, alignment
+from calibslam_backend.output.object_map import MapFileError, ObjectMap, tum_lines
+from calibslam_backend.output.plots import plot_run
+from calibslam_backend.output.run_folder import accuracy
 from calibslam_msgs_py.command import command
 from calibslam_msgs_py.measurements import Array, RelativeMotion
-from calibslam_sim.object_accuracy import object_accuracy
-from calibslam_sim.reference import NoReference, Reference, read_reference
+from calibslam_sim.accuracy.objects import object_accuracy
+from calibslam_sim.accuracy.reference import NoReference, Reference, read_reference
 
 
 def evaluate(folder: Path, reference: Reference) -> dict[str, Any]:

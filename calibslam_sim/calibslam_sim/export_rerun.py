@@ -12,10 +12,10 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from calibslam_backend.object_map import MapFileError, ObjectMap
+from calibslam_backend.output.object_map import MapFileError, ObjectMap
 from calibslam_backend.recording import CAMERA
-from calibslam_detector.image_conversion import decode_image
-from calibslam_detector.overlay import class_colour
+from calibslam_detector.images.image_conversion import decode_image
+from calibslam_detector.images.overlay import class_colour
 from calibslam_msgs_py.bags import BagError, BagReader
 from calibslam_msgs_py.command import command
 from calibslam_msgs_py.conversions import camera_from_msg, stamp_from_msg

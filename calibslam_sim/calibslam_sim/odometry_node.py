@@ -17,7 +17,7 @@ from geometry_msgs.msg import PoseStamped
 from nav_msgs.msg import Odometry
 from rclpy.node import Node
 
-from calibslam_backend.odometry import OdometryDifferencer
+from calibslam_backend.odometry.motion_chain import OdometryDifferencer
 from calibslam_msgs_py.conversions import (
     RosTypes,
     motion_to_msg,
@@ -27,8 +27,8 @@ from calibslam_msgs_py.conversions import (
 from calibslam_msgs_py.measurements import InvalidMeasurement, RelativeMotion
 from calibslam_msgs_py.node import MEASUREMENT, MEASUREMENT_INPUT, Counters, advertise, run, subscribe
 from calibslam_msgs_py.settings import Settings, SettingsError, declare_parameters, setting
-from calibslam_sim.odometry_noise import OdometryNoise, add_noise
-from calibslam_sim.random_streams import stream
+from calibslam_sim.simulation.odometry_noise import OdometryNoise, add_noise
+from calibslam_sim.simulation.random_streams import stream
 
 CAMERA_FRAME = "camera"  # whose pose the topic `ground_truth` is
 

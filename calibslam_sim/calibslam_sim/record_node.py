@@ -12,7 +12,7 @@ from typing import Any
 from rclpy.node import Node
 from rclpy.serialization import serialize_message
 
-from calibslam_backend.published import TOPICS
+from calibslam_backend.output.published import TOPICS
 from calibslam_msgs_py.bags import BagError, BagWriter
 from calibslam_msgs_py.conversions import RosTypes, stamp_from_msg
 from calibslam_msgs_py.node import LATCHED, run

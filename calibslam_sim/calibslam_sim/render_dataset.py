@@ -16,14 +16,14 @@ import numpy as np
 from calibslam_msgs_py.command import command
 from calibslam_msgs_py.measurements import SECOND
 from calibslam_msgs_py.settings import Settings, add_arguments, from_arguments, setting
-from calibslam_sim.camera_path import LAP, START
-from calibslam_sim.coco_writer import CocoError, CocoWriter
 from calibslam_sim.progress import Progress
-from calibslam_sim.random_streams import stream
-from calibslam_sim.render import Renderer
-from calibslam_sim.render_looks import FAMILIES
-from calibslam_sim.simulation import CAMERA
-from calibslam_sim.world import desk_world
+from calibslam_sim.rendering.coco_writer import CocoError, CocoWriter
+from calibslam_sim.rendering.looks import FAMILIES
+from calibslam_sim.rendering.render import Renderer
+from calibslam_sim.simulation.camera_path import LAP, START
+from calibslam_sim.simulation.random_streams import stream
+from calibslam_sim.simulation.recording import CAMERA
+from calibslam_sim.simulation.world import desk_world
 
 PACES = (0.3, 2.5)  # between a slow and a hasty walk
 

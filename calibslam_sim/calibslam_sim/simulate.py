@@ -23,11 +23,11 @@ from calibslam_msgs_py.conversions import (
 from calibslam_msgs_py.measurements import QuadricEstimate, StampedPose
 from calibslam_msgs_py.settings import add_arguments, from_arguments
 from calibslam_sim import topics
-from calibslam_sim.coco_writer import CocoError, CocoWriter
 from calibslam_sim.progress import Progress
-from calibslam_sim.render import RenderedImage, Renderer
-from calibslam_sim.render_looks import FAMILIES
-from calibslam_sim.simulation import SCENARIOS, Simulation, SimulationSettings, simulate
+from calibslam_sim.rendering.coco_writer import CocoError, CocoWriter
+from calibslam_sim.rendering.looks import FAMILIES
+from calibslam_sim.rendering.render import RenderedImage, Renderer
+from calibslam_sim.simulation.recording import SCENARIOS, Simulation, SimulationSettings, simulate
 
 SCENARIO_HELP = "which defaults the other options have (default: desk); " + "; ".join(
     f"{name}: {', '.join(f'{option} {value:g}' for option, value in changes.items()) or 'as stated here'}"

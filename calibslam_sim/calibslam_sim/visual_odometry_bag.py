@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from calibslam_backend.metrics import NoGroundTruth, Trajectory, ate
+from calibslam_backend.output.metrics import NoGroundTruth, Trajectory, ate
 from calibslam_backend.recording import MOTIONS
 from calibslam_msgs_py import bags
 from calibslam_msgs_py.bags import BagError, BagReader, BagWriter
@@ -26,11 +26,11 @@ from calibslam_msgs_py.conversions import camera_from_msg, motion_to_msg, stampe
 from calibslam_msgs_py.measurements import Camera, InvalidMeasurement, RelativeMotion
 from calibslam_msgs_py.settings import SettingsError, add_arguments, from_arguments
 from calibslam_sim import topics
-from calibslam_sim.depth_camera import DepthCamera, DepthCameraSettings
-from calibslam_sim.image_pairs import Pair
-from calibslam_sim.motion_accuracy import motion_accuracy, trajectory_of, truth_noise
+from calibslam_sim.accuracy.motions import motion_accuracy, trajectory_of, truth_noise
 from calibslam_sim.progress import Progress
-from calibslam_sim.visual_odometry import Step, VisualOdometrySettings
+from calibslam_sim.rendering.depth_camera import DepthCamera, DepthCameraSettings
+from calibslam_sim.visual_odometry.frame_odometry import Step, VisualOdometrySettings
+from calibslam_sim.visual_odometry.image_pairs import Pair
 
 # The first of each that the bag has.
 IMAGES = (topics.IMAGE, topics.RAW_IMAGE)

@@ -21,9 +21,9 @@ from calibslam_msgs_py.node import MEASUREMENT, SECONDS_BETWEEN_WARNINGS, SENSOR
 from calibslam_msgs_py.node_sensors import SensorSubscription
 from calibslam_msgs_py.node_worker import NewestWorker
 from calibslam_msgs_py.settings import declare_parameters
-from calibslam_sim.depth_camera import DepthCamera, DepthCameraSettings
-from calibslam_sim.image_pairs import Pair
-from calibslam_sim.visual_odometry import VisualOdometrySettings
+from calibslam_sim.rendering.depth_camera import DepthCamera, DepthCameraSettings
+from calibslam_sim.visual_odometry.frame_odometry import VisualOdometrySettings
+from calibslam_sim.visual_odometry.image_pairs import Pair
 
 
 class VisualOdometryNode(Node):

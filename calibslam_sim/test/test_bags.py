@@ -20,8 +20,8 @@ from calibslam_msgs_py.conversions import (
     valid_boxes,
 )
 from calibslam_sim import simulate, topics, tum_to_bag
-from calibslam_sim.simulation import CAMERA, SimulationSettings
-from calibslam_sim.simulation import simulate as simulated
+from calibslam_sim.simulation.recording import CAMERA, SimulationSettings
+from calibslam_sim.simulation.recording import simulate as simulated
 
 SETTINGS = SimulationSettings(seed=5, duration=1.0)
 OPTIONS = ["--seed", "5", "--duration", "1"]

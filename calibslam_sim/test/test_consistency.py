@@ -12,11 +12,11 @@ import pytest
 from scipy import stats
 from simulated_runs import position_nees_at_the_end, quadric_nees, run
 
-from calibslam_backend.association import GIVEN
+from calibslam_backend.association.matching import GIVEN
 from calibslam_backend.estimator import EstimatorSettings
-from calibslam_backend.noise import CALIBRATED, FIXED, QUADRICSLAM
+from calibslam_backend.graph.noise import CALIBRATED, FIXED, QUADRICSLAM
 from calibslam_sim.experiments.statistics import nees_interval, paired
-from calibslam_sim.simulation import SCENARIOS, SimulationSettings, simulate
+from calibslam_sim.simulation.recording import SCENARIOS, SimulationSettings, simulate
 
 SEEDS = 25
 DESK = SimulationSettings(duration=20.0, frame_rate=10.0)

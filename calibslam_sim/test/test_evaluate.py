@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from calibslam_backend.object_map import ObjectMap
+from calibslam_backend.output.object_map import ObjectMap
 from calibslam_msgs_py.bags import BagWriter
 from calibslam_msgs_py.measurements import QuadricEstimate
 from calibslam_sim import evaluate, topics
-from calibslam_sim.reference import NoReference, read_reference
+from calibslam_sim.accuracy.reference import NoReference, read_reference
 from calibslam_sim.simulate import write_bag
-from calibslam_sim.simulation import SimulationSettings, simulate
+from calibslam_sim.simulation.recording import SimulationSettings, simulate
 
 SIMULATION = simulate(SimulationSettings(seed=1, duration=4.0))
 EVERY = 10  # image is a keyframe

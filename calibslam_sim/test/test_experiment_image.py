@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 import torch
 
-from calibslam_detector import weights_file
-from calibslam_detector.detector import Detector, DetectorSettings
-from calibslam_detector.network import CalibratedDetector
+from calibslam_detector.model import weights_file
+from calibslam_detector.model.detector import Detector, DetectorSettings
+from calibslam_detector.model.network import CalibratedDetector
 from calibslam_sim import experiment
 from calibslam_sim.experiments import engine, image
 from calibslam_sim.experiments.covariance_heads import CovarianceHeads

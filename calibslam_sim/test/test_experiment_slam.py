@@ -11,14 +11,14 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from calibslam_backend.object_map import ObjectMap
+from calibslam_backend.output.object_map import ObjectMap
 from calibslam_msgs_py.measurements import SECOND, Array, Boxes, Camera, QuadricEstimate, RelativeMotion
 from calibslam_sim import experiment
 from calibslam_sim.experiments import quadric_sim, tum
 from calibslam_sim.experiments.design import ExperimentError, repetition_seed
 from calibslam_sim.experiments.object_slam import estimate
-from calibslam_sim.failing_odometry import OdometryFailures
-from calibslam_sim.simulation import Simulation, SimulationSettings, simulate
+from calibslam_sim.simulation.failing_odometry import OdometryFailures
+from calibslam_sim.simulation.recording import Simulation, SimulationSettings, simulate
 
 QUICK = quadric_sim.QuadricSimSettings(duration=8.0)
 

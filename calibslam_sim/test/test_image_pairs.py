@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from calibslam_msgs_py.measurements import SECOND
-from calibslam_sim.image_pairs import WAITING, ImagePairs, Pair
+from calibslam_sim.visual_odometry.image_pairs import WAITING, ImagePairs, Pair
 
 MS = 1_000_000
 

@@ -12,8 +12,8 @@ import gtsam
 import numpy as np
 import pytest
 
-from calibslam_backend.object_map import ObjectMap
-from calibslam_backend.quadric import project
+from calibslam_backend.geometry.visible_box import project
+from calibslam_backend.output.object_map import ObjectMap
 from calibslam_msgs_py import bags
 from calibslam_msgs_py.bags import BagWriter
 from calibslam_msgs_py.conversions import boxes_to_msg, camera_to_msg, header_to_msg, motion_to_msg

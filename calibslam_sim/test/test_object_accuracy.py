@@ -8,9 +8,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from calibslam_backend.quadric import Ellipsoid
-from calibslam_sim.object_accuracy import MAX_CENTRE_DISTANCE, iou, matches, object_accuracy
-from calibslam_sim.sampling import unit_cube
+from calibslam_backend.geometry.ellipsoid import Ellipsoid
+from calibslam_sim.accuracy.objects import MAX_CENTRE_DISTANCE, iou, matches, object_accuracy
+from calibslam_sim.simulation.sampling import unit_cube
 
 
 def ellipsoid(centre: list[float], radii: list[float], rotation: list[float] | None = None) -> Ellipsoid:

@@ -11,17 +11,17 @@ import numpy as np
 import pytest
 from pycocotools.coco import COCO
 
-from calibslam_backend.quadric import Ellipsoid
+from calibslam_backend.geometry.ellipsoid import Ellipsoid
 from calibslam_msgs_py.bags import BagReader
 from calibslam_msgs_py.measurements import SECOND, Camera
 from calibslam_sim import render_dataset, simulate, topics
-from calibslam_sim.camera_path import START
-from calibslam_sim.coco_writer import CLASSES
-from calibslam_sim.render import SAME_EDGE, Renderer
-from calibslam_sim.render_kernels import cast, cast_shadows, visible_parts
-from calibslam_sim.render_looks import FAMILIAR, FAMILIES, FOREIGN
-from calibslam_sim.simulation import CAMERA
-from calibslam_sim.world import desk_world
+from calibslam_sim.rendering.coco_writer import CLASSES
+from calibslam_sim.rendering.kernels import cast, cast_shadows, visible_parts
+from calibslam_sim.rendering.looks import FAMILIAR, FAMILIES, FOREIGN
+from calibslam_sim.rendering.render import SAME_EDGE, Renderer
+from calibslam_sim.simulation.camera_path import START
+from calibslam_sim.simulation.recording import CAMERA
+from calibslam_sim.simulation.world import desk_world
 
 K = np.array([[100.0, 0.0, 80.0], [0.0, 100.0, 60.0], [0.0, 0.0, 1.0]])
 SMALL = Camera(width=160, height=120, K=K, distortion=np.zeros(5))

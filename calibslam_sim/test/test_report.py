@@ -15,14 +15,15 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from calibslam_backend.box_measurement import BORDER_SIGMAS
-from calibslam_backend.object_map import ObjectMap
-from calibslam_backend.quadric import Ellipsoid, project
+from calibslam_backend.geometry.box_measurement import BORDER_SIGMAS
+from calibslam_backend.geometry.ellipsoid import Ellipsoid
+from calibslam_backend.geometry.visible_box import project
+from calibslam_backend.output.object_map import ObjectMap
 from calibslam_msgs_py.bags import BagReader, BagWriter
 from calibslam_msgs_py.measurements import Boxes, QuadricEstimate
 from calibslam_sim import report
-from calibslam_sim.render import Renderer
-from calibslam_sim.render_looks import FAMILIES
+from calibslam_sim.rendering.looks import FAMILIES
+from calibslam_sim.rendering.render import Renderer
 from calibslam_sim.run_report import boxes, style
 from calibslam_sim.run_report.image_view import projected_outline
 from calibslam_sim.run_report.loading import ReportError, load_run, load_runs, names
@@ -30,7 +31,7 @@ from calibslam_sim.run_report.page import metrics_table, page
 from calibslam_sim.run_report.sightings import Sightings, find_sightings
 from calibslam_sim.run_report.space import unit_sphere
 from calibslam_sim.simulate import write_bag
-from calibslam_sim.simulation import CAMERA, SimulationSettings, simulate
+from calibslam_sim.simulation.recording import CAMERA, SimulationSettings, simulate
 
 SIMULATION = simulate(SimulationSettings(seed=1, duration=4.0))
 EVERY = 3  # image is a keyframe

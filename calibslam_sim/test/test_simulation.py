@@ -11,15 +11,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
-from calibslam_backend.quadric import Ellipsoid, image_bounds, project
+from calibslam_backend.geometry.ellipsoid import Ellipsoid
+from calibslam_backend.geometry.visible_box import image_bounds, project
 from calibslam_msgs_py.measurements import Array
-from calibslam_sim.camera_path import ORBIT, camera_path, stamps
-from calibslam_sim.detections import Detector
-from calibslam_sim.gross_errors import KINDS
-from calibslam_sim.occlusion import hidden_shares
-from calibslam_sim.random_streams import stream
-from calibslam_sim.simulation import CAMERA, SCENARIOS, Simulation, SimulationSettings, simulate
-from calibslam_sim.world import CLEARANCE, TABLE_HEIGHT, desk_world
+from calibslam_sim.simulation.camera_path import ORBIT, camera_path, stamps
+from calibslam_sim.simulation.detections import Detector
+from calibslam_sim.simulation.gross_errors import KINDS
+from calibslam_sim.simulation.occlusion import hidden_shares
+from calibslam_sim.simulation.random_streams import stream
+from calibslam_sim.simulation.recording import CAMERA, SCENARIOS, Simulation, SimulationSettings, simulate
+from calibslam_sim.simulation.world import CLEARANCE, TABLE_HEIGHT, desk_world
 
 
 @functools.cache

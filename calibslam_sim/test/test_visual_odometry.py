@@ -8,12 +8,12 @@ import plane_scene
 import pytest
 from plane_scene import CAMERA
 
-from calibslam_backend.metrics import Trajectory
+from calibslam_backend.output.metrics import Trajectory
 from calibslam_msgs_py.measurements import SECOND, InvalidMeasurement, RelativeMotion
-from calibslam_sim import point_pose as module
-from calibslam_sim.motion_accuracy import motion_accuracy, truth_noise
-from calibslam_sim.point_pose import Undetermined, moved, point_pose
-from calibslam_sim.visual_odometry import Step, VisualOdometry, VisualOdometrySettings
+from calibslam_sim.accuracy.motions import motion_accuracy, truth_noise
+from calibslam_sim.visual_odometry import point_pose as module
+from calibslam_sim.visual_odometry.frame_odometry import Step, VisualOdometry, VisualOdometrySettings
+from calibslam_sim.visual_odometry.point_pose import Undetermined, moved, point_pose
 
 PERIOD = SECOND // 15
 VELOCITY = np.array([0.3, -0.2, 0.1, 0.1, 0.2, -0.1])

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from calibslam_backend import box_measurement
+from calibslam_backend.geometry import box_measurement
 from calibslam_backend.reference_boxes import ReferenceSettings, of_recording
 
 DISTANCES = (0.0, 1.0, 2.0, 3.0, 4.0, 6.0, 10.0, np.inf)

@@ -23,8 +23,8 @@ from calibslam_msgs.srv import SaveMap
 from live import Watcher, kept, random_domain, wait_until
 from live_graph import DATA, Player, backend, recording_of, truth_of
 
-from calibslam_backend.metrics import Trajectory, ate
-from calibslam_backend.object_map import ObjectMap
+from calibslam_backend.output.metrics import Trajectory, ate
+from calibslam_backend.output.object_map import ObjectMap
 from calibslam_backend.recording import Recording
 from calibslam_msgs_py.measurements import Boxes
 

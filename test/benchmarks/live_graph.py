@@ -16,7 +16,7 @@ from live import Process, Watcher
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import CameraInfo
 
-from calibslam_backend.metrics import Trajectory
+from calibslam_backend.output.metrics import Trajectory
 from calibslam_backend.recording import Recording
 from calibslam_msgs_py.conversions import RosTypes, boxes_to_msg, camera_to_msg, motion_to_msg
 from calibslam_msgs_py.measurements import SECOND, Boxes, Camera, RelativeMotion

@@ -25,8 +25,8 @@ import numpy as np
 from live_graph import DATA
 from scipy.optimize import minimize
 
-from calibslam_backend.metrics import Trajectory, interpolated
-from calibslam_backend.motion_noise import MotionNoise
+from calibslam_backend.odometry.motion_noise import MotionNoise
+from calibslam_backend.output.metrics import Trajectory, interpolated
 from calibslam_msgs_py.measurements import SECOND, Array
 from calibslam_sim.tum_folder import read_trajectory
 

@@ -11,12 +11,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calibslam_backend.estimator import Estimator, EstimatorSettings, Keyframe
-from calibslam_backend.graph import T_MAP_FIRST_CAMERA
-from calibslam_backend.metrics import Trajectory, ate
-from calibslam_backend.quadric import Ellipsoid
+from calibslam_backend.estimator import Estimator, EstimatorSettings
+from calibslam_backend.geometry.ellipsoid import Ellipsoid
+from calibslam_backend.graph.object_graph import T_MAP_FIRST_CAMERA
+from calibslam_backend.keyframe import Keyframe
+from calibslam_backend.output.metrics import Trajectory, ate
 from calibslam_msgs_py.measurements import Array, Boxes, RelativeMotion
-from calibslam_sim.simulation import Simulation
+from calibslam_sim.simulation.recording import Simulation
 
 
 @dataclass(frozen=True)

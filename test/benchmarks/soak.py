@@ -30,7 +30,7 @@ from live_graph import KEPT, TYPES, backend, cpu_seconds
 from sensor_msgs.msg import CameraInfo
 from small_world import CAMERA, SmallWorld, around
 
-from calibslam_backend.quadric import Ellipsoid
+from calibslam_backend.geometry.ellipsoid import Ellipsoid
 from calibslam_msgs_py.conversions import boxes_to_msg, camera_to_msg, motion_to_msg, stamp_to_msg
 from calibslam_msgs_py.measurements import SECOND
 

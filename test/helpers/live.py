@@ -20,7 +20,7 @@ from diagnostic_msgs.msg import DiagnosticArray
 from nav_msgs.msg import Path as PathMessage
 from rclpy.node import Node
 
-from calibslam_backend.metrics import Trajectory
+from calibslam_backend.output.metrics import Trajectory
 from calibslam_msgs_py.conversions import pose_from_msg, stamp_from_msg
 from calibslam_msgs_py.node import LATCHED, make_executor
 

@@ -6,15 +6,17 @@ from collections import Counter
 
 import numpy as np
 
-from calibslam_backend.assignments import Assignments, Frame
-from calibslam_backend.box_measurement import prepare
-from calibslam_backend.data_association import DataAssociation
+from calibslam_backend.association.assignments import Assignments, Frame
+from calibslam_backend.association.data_association import DataAssociation
 from calibslam_backend.estimator_settings import EstimatorSettings
-from calibslam_backend.graph import Motion, ObjectGraph
+from calibslam_backend.geometry.box_measurement import prepare
+from calibslam_backend.geometry.ellipsoid import Ellipsoid
+from calibslam_backend.geometry.visible_box import ALL_EDGES, box_of_visible_part, image_bounds
+from calibslam_backend.graph.measured import Motion
+from calibslam_backend.graph.object_graph import ObjectGraph
 from calibslam_backend.kernels import load_kernels
-from calibslam_backend.new_quadrics import NewQuadrics
-from calibslam_backend.quadric import ALL_EDGES, Ellipsoid, box_of_visible_part, image_bounds
-from calibslam_backend.upkeep import Upkeep
+from calibslam_backend.objects.new_quadrics import NewQuadrics
+from calibslam_backend.objects.upkeep import Upkeep
 from calibslam_msgs_py.measurements import Array, Boxes, Camera
 
 CAMERA = Camera(640, 480, np.array([[500.0, 0.0, 320.0], [0.0, 500.0, 240.0], [0.0, 0.0, 1.0]]), np.zeros(5))

@@ -8,8 +8,9 @@ from dataclasses import dataclass
 import gtsam
 import numpy as np
 
-from calibslam_backend.metrics import Trajectory
-from calibslam_backend.quadric import Ellipsoid, image_bounds, project
+from calibslam_backend.geometry.ellipsoid import Ellipsoid
+from calibslam_backend.geometry.visible_box import image_bounds, project
+from calibslam_backend.output.metrics import Trajectory
 from calibslam_msgs_py.measurements import Array, Boxes, Camera, RelativeMotion
 
 SECOND = 1_000_000_000

@@ -15,12 +15,12 @@ from typing import Any
 
 import numpy as np
 
-from calibslam_backend.association import ESTIMATED
+from calibslam_backend.association.matching import ESTIMATED
 from calibslam_backend.estimator import EstimatorSettings
-from calibslam_backend.noise import CALIBRATED as OWN_COVARIANCE
-from calibslam_backend.noise import FIXED, QUADRICSLAM
-from calibslam_detector.image_conversion import decode_compressed
-from calibslam_detector.weights_file import SHIPPED
+from calibslam_backend.graph.noise import CALIBRATED as OWN_COVARIANCE
+from calibslam_backend.graph.noise import FIXED, QUADRICSLAM
+from calibslam_detector.images.image_conversion import decode_compressed
+from calibslam_detector.model.weights_file import SHIPPED
 from calibslam_msgs_py.conversions import valid_boxes
 from calibslam_msgs_py.measurements import Boxes
 from calibslam_msgs_py.settings import setting
@@ -35,9 +35,9 @@ from calibslam_sim.experiments.design import (
 from calibslam_sim.experiments.figures import condition_figure
 from calibslam_sim.experiments.object_slam import estimate
 from calibslam_sim.experiments.quadric_sim import METRICS, accuracy
-from calibslam_sim.render import Renderer
-from calibslam_sim.render_looks import FAMILIES
-from calibslam_sim.simulation import Simulation, SimulationSettings, simulate
+from calibslam_sim.rendering.looks import FAMILIES
+from calibslam_sim.rendering.render import Renderer
+from calibslam_sim.simulation.recording import Simulation, SimulationSettings, simulate
 
 NLL = "nll"
 # Condition -> covariance head whose boxes are taken, and noise model of the back end.

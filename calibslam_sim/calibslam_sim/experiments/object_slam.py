@@ -7,8 +7,8 @@ from collections.abc import Iterable
 import numpy as np
 
 from calibslam_backend.estimator import Estimator, EstimatorSettings
-from calibslam_backend.metrics import Trajectory, ate, position_nees, rpe
-from calibslam_backend.object_map import ObjectMap
+from calibslam_backend.output.metrics import Trajectory, ate, position_nees, rpe
+from calibslam_backend.output.object_map import ObjectMap
 from calibslam_msgs_py.measurements import Boxes, Camera, RelativeMotion
 from calibslam_sim.experiments.design import Metrics
 

@@ -14,14 +14,15 @@ from typing import Any
 
 import numpy as np
 
-from calibslam_backend.association import ESTIMATED, GIVEN
+from calibslam_backend.association.matching import ESTIMATED, GIVEN
 from calibslam_backend.estimator import EstimatorSettings
-from calibslam_backend.metrics import Trajectory, alignment
-from calibslam_backend.noise import CALIBRATED as OWN_COVARIANCE
-from calibslam_backend.noise import FIXED, QUADRICSLAM
-from calibslam_backend.object_map import ObjectMap
-from calibslam_backend.quadric import Ellipsoid
+from calibslam_backend.geometry.ellipsoid import Ellipsoid
+from calibslam_backend.graph.noise import CALIBRATED as OWN_COVARIANCE
+from calibslam_backend.graph.noise import FIXED, QUADRICSLAM
+from calibslam_backend.output.metrics import Trajectory, alignment
+from calibslam_backend.output.object_map import ObjectMap
 from calibslam_msgs_py.settings import setting
+from calibslam_sim.accuracy.objects import object_accuracy
 from calibslam_sim.experiments.design import (
     CALIBRATED,
     OVERCONFIDENT,
@@ -34,8 +35,7 @@ from calibslam_sim.experiments.design import (
 )
 from calibslam_sim.experiments.figures import condition_figure
 from calibslam_sim.experiments.object_slam import accuracy_of_trajectory, estimate
-from calibslam_sim.object_accuracy import object_accuracy
-from calibslam_sim.simulation import Simulation, SimulationSettings, simulate
+from calibslam_sim.simulation.recording import Simulation, SimulationSettings, simulate
 
 OUTLIERS = "outliers_"  # conditions in which some boxes are grossly wrong
 # Condition -> noise model of the back end, and factor on its standard deviations.

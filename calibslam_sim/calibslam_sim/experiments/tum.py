@@ -31,11 +31,11 @@ from typing import Any
 
 import numpy as np
 
-from calibslam_backend.association import ESTIMATED, GIVEN
+from calibslam_backend.association.matching import ESTIMATED, GIVEN
 from calibslam_backend.estimator import EstimatorSettings
-from calibslam_backend.metrics import NoGroundTruth, Trajectory
-from calibslam_backend.noise import CALIBRATED as OWN_COVARIANCE
-from calibslam_backend.noise import FIXED, QUADRICSLAM
+from calibslam_backend.graph.noise import CALIBRATED as OWN_COVARIANCE
+from calibslam_backend.graph.noise import FIXED, QUADRICSLAM
+from calibslam_backend.output.metrics import NoGroundTruth, Trajectory
 from calibslam_backend.recording import load_calibrator
 from calibslam_msgs_py.bags import BagError
 from calibslam_msgs_py.measurements import Boxes, Camera, RelativeMotion, StampedPose
@@ -54,8 +54,8 @@ from calibslam_sim.experiments.design import (
 )
 from calibslam_sim.experiments.figures import condition_figure
 from calibslam_sim.experiments.object_slam import accuracy_of_trajectory, estimate
-from calibslam_sim.failing_odometry import OdometryFailures
-from calibslam_sim.odometry_noise import OdometryNoise
+from calibslam_sim.simulation.failing_odometry import OdometryFailures
+from calibslam_sim.simulation.odometry_noise import OdometryNoise
 from calibslam_sim.tum_folder import TumError, read_camera, read_detections, read_trajectory
 
 MODELS = (CALIBRATED, FIXED, QUADRICSLAM)

@@ -7,9 +7,9 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 import plotly.graph_objects as go
 
-from calibslam_backend.metrics import interpolated
-from calibslam_backend.noise import NoiseSettings
-from calibslam_backend.quadric import Ellipsoid
+from calibslam_backend.geometry.ellipsoid import Ellipsoid
+from calibslam_backend.graph.noise import NoiseSettings
+from calibslam_backend.output.metrics import interpolated
 from calibslam_detector.calibration.metrics import whitened
 from calibslam_detector.calibration.reliability import reliability
 from calibslam_msgs_py.measurements import Array

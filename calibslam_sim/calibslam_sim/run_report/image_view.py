@@ -9,8 +9,8 @@ from html import escape
 import cv2
 import numpy as np
 
-from calibslam_detector.image_conversion import decode_image, encode_jpeg
-from calibslam_detector.overlay import ellipse_axes
+from calibslam_detector.images.image_conversion import decode_image, encode_jpeg
+from calibslam_detector.images.overlay import ellipse_axes
 from calibslam_msgs_py.bags import BagReader
 from calibslam_msgs_py.conversions import stamp_from_msg
 from calibslam_msgs_py.measurements import Array, Boxes, Camera, InvalidMeasurement

@@ -10,11 +10,11 @@ from typing import Any
 
 import numpy as np
 
-from calibslam_backend.metrics import NoGroundTruth, Trajectory, alignment, interpolated
-from calibslam_backend.object_map import MapFileError, ObjectMap
-from calibslam_backend.quadric import Ellipsoid
+from calibslam_backend.geometry.ellipsoid import Ellipsoid
+from calibslam_backend.output.metrics import NoGroundTruth, Trajectory, alignment, interpolated
+from calibslam_backend.output.object_map import MapFileError, ObjectMap
+from calibslam_backend.output.run_folder import accuracy
 from calibslam_backend.recording import Recording
-from calibslam_backend.run_folder import accuracy
 from calibslam_msgs_py.bags import BagError, BagReader
 from calibslam_msgs_py.conversions import quadrics_from_msg
 from calibslam_msgs_py.measurements import SECOND, Array, Boxes, Camera, RelativeMotion

@@ -12,11 +12,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from calibslam_backend.association import assign, predicted_corners
-from calibslam_backend.box_measurement import BoxMeasurement, prepare
-from calibslam_backend.noise import spread
-from calibslam_backend.quadric import Ellipsoid
-from calibslam_backend.tracking import overlap
+from calibslam_backend.association.matching import assign, predicted_corners
+from calibslam_backend.association.tracking import overlap
+from calibslam_backend.geometry.box_measurement import BoxMeasurement, prepare
+from calibslam_backend.geometry.ellipsoid import Ellipsoid
+from calibslam_backend.graph.noise import spread
 from calibslam_msgs_py.measurements import Array, Boxes, Camera
 
 MIN_OVERLAP = 0.3  # intersection over union below which a box does not show a quadric

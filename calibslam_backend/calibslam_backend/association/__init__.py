@@ -1,0 +1,1 @@
+"""Which box is of which quadric, and where a camera is that sees known ones."""

@@ -1,0 +1,270 @@
+"""Which quadric of the map a track is of.
+
+A track is open until it is bound to a quadric, which happens when several keyframes agree on one (`vote`,
+`relocalise`) or when its own boxes determine a new one (`new_quadrics`). What turns out to be wrong is mended in
+`upkeep`.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import replace
+
+import numpy as np
+
+from calibslam_backend.association.assignments import Assignments, Frame
+from calibslam_backend.association.innovation import innovations
+from calibslam_backend.association.localisation import localise
+from calibslam_backend.association.matching import (
+    GIVEN,
+    Prediction,
+    Votes,
+    assign,
+    distances,
+    predict,
+    predicted_corners,
+    unambiguous,
+)
+from calibslam_backend.association.relocalisation import Relocalised, relocalise
+from calibslam_backend.association.tracking import overlap
+from calibslam_backend.estimator_settings import EstimatorSettings
+from calibslam_backend.geometry.box_measurement import BoxMeasurement, prepare
+from calibslam_backend.graph.noise import NoiseModel, spread
+from calibslam_backend.graph.object_graph import ObjectGraph, UpdateReport
+from calibslam_msgs_py.measurements import Array, Boxes, Camera
+
+
+class DataAssociation:
+    """Decides for the boxes of the newest keyframe; gives the graph its quadrics and boxes.
+
+    Attributes:
+        counts: what happened, by name; shared with the estimator.
+    """
+
+    # A bound track whose boxes miss their quadric so often in a row has slipped to another object.
+    MAX_MISFITS = 3
+    LEAST_FIT = 0.1  # overlap of a box with its quadric's that is no misfit
+    # Standard deviations that a camera can be from where it is thought to be. They are too small on real data, by a
+    # factor of about four; rows of like objects, seen from the other side of the room, are 70 and more away.
+    FARTHEST = 20.0
+
+    def __init__(
+        self, assignments: Assignments, camera: Camera, settings: EstimatorSettings, counts: Counter[str]
+    ) -> None:
+        self.camera, self.settings, self.counts = camera, settings, counts
+        self._assignments = assignments
+        self._graph: ObjectGraph = assignments.graph
+        self._noise = NoiseModel(settings)
+        self._votes = Votes(settings.votes)
+        # (bound quadric, the one that it was found to be) -> tracks of which it was found.
+        self._taken_for: dict[tuple[int, int], set[int]] = {}
+
+    def frame(self, boxes: Boxes, tracks: list[int]) -> Frame:
+        """The boxes of an image made ready, with the covariances the noise model gives them."""
+        covariances = np.empty((len(boxes), 4, 4))
+        for i, track in enumerate(tracks):
+            quadric = self._assignments.tracks[track].quadric
+            key = ~track if quadric is None else quadric
+            self._noise.observe(key, boxes.corners[i])
+            covariances[i] = self._noise.covariance(key, boxes.covariances[i])
+        measurements = prepare(boxes, covariances, self.camera)
+        return Frame(measurements, tracks, boxes.class_ids, boxes.object_ids, [None] * len(boxes))
+
+    # -- a keyframe ---------------------------------------------------------------------------------------------
+
+    def localise(self, frame: Frame, predicted: Array, covariance: Array) -> Array:
+        """First estimate of the pose, from odometry and the boxes of bound tracks."""
+        known = [(self._graph.quadric(j), box) for j, box in self._assignments.bound(frame)]
+        s = self.settings
+        quadrics, boxes = [vector for vector, _ in known], [box for _, box in known]
+        scales = s.robust_scale, s.robust_odometry
+        return localise(predicted, covariance, quadrics, boxes, self.camera.K, *scales, self._graph.correlation.worth)
+
+    def innovations(self, frame: Frame, predicted: Array, covariance: Array) -> Array:
+        """Normalised innovations squared of the boxes of bound tracks; arguments as in `localise`."""
+        known = [(j, box) for j, box in self._assignments.bound(frame) if self._graph.is_solved(j)]
+        ids = sorted({j for j, _ in known})
+        joint = dict(zip(ids, self._covariances_after(len(self._assignments.frames) - 1, ids, covariance), strict=True))
+        vectors, boxes = [self._graph.quadric(j) for j, _ in known], [box for _, box in known]
+        return innovations(predicted, vectors, [joint[j] for j, _ in known], boxes, self.camera.K)
+
+    def _covariances_after(self, k: int, quadrics: list[int], step: Array) -> list[Array]:
+        """For each of these quadrics (15, 15) of it and of a pose that is a step (6, 6) after that of keyframe k."""
+        joint = self._graph.joint_covariances(k, quadrics)
+        for each in joint:
+            each[:6, :6] += step
+        return joint
+
+    def add(self, frame: Frame) -> int:
+        """The boxes of the newest keyframe; those of bound tracks go to their quadrics. Returns how many."""
+        k = len(self._assignments.frames)
+        self._assignments.frames.append(frame)
+        used = 0
+        T = self._graph.pose(k)
+        for n, (track, box) in enumerate(zip(frame.tracks, frame.boxes, strict=True)):
+            candidate = self._assignments.tracks[track]
+            candidate.seen.append((k, n))
+            if candidate.quadric is None:
+                continue
+            corners = predicted_corners(T, self._graph.quadric(candidate.quadric), self.camera.K, box)
+            # Identities that are given are no matter of where the camera is thought to be.
+            fits = corners is not None and (
+                self.settings.association == GIVEN or overlap(corners[None], box.corners[None])[0, 0] >= self.LEAST_FIT
+            )
+            if fits and self._assignments.give(k, n, candidate.quadric):
+                candidate.misfits = 0
+                used += 1
+                continue
+            self.counts["rejected_misfit"] += 1
+            candidate.misfits += 1
+            if candidate.misfits >= self.MAX_MISFITS and self.settings.association != GIVEN:
+                self.counts["unbound"] += 1
+                candidate.quadric, candidate.misfits = None, 0
+        return used
+
+    # -- quadrics that are known --------------------------------------------------------------------------------
+
+    def vote(self, k: int, step: Array) -> None:
+        """Open tracks of keyframe k, a step of covariance (6, 6) after the last one, vote for the quadrics that explain
+        their boxes."""
+        if self.settings.association == GIVEN:
+            return
+        tracks, frame = self._assignments.tracks, self._assignments.frames[k]
+        taken = {tracks[t].quadric for t in frame.tracks}
+        rows = [n for n, t in enumerate(frame.tracks) if tracks[t].quadric is None]
+        if not rows:
+            return
+        T = self._graph.pose(k)
+        open_boxes = [frame.boxes[n] for n in rows]
+        near = [
+            j
+            for j in self._graph.landmarks
+            if j not in taken and self._graph.is_solved(j) and self._in_question(T, j, open_boxes)
+        ]
+        predictions = []
+        for j, covariance in zip(near, self._covariances_after(k - 1, near, step), strict=True):
+            vector = self._graph.quadric(j)
+            prediction = predict(T, vector, covariance, self.camera.K, open_boxes[0], self.settings.model_error)
+            if prediction is not None:
+                predictions.append(Prediction(j, *prediction, self._assignments.class_of_quadric(j)))
+        classes = [tracks[frame.tracks[n]].class_id for n in rows]
+        cost = distances(predictions, open_boxes, classes, self.settings)
+        for p, r in unambiguous(cost, assign(cost), self.settings.ambiguity):
+            self._vote_for(frame.tracks[rows[r]], predictions[p].landmark)
+
+    def _in_question(self, T_map_camera: Array, j: int, boxes: list[BoxMeasurement]) -> bool:
+        """Whether one of these boxes may be of a quadric: worth the cost of its joint covariance with the pose."""
+        predicted = predicted_corners(T_map_camera, self._graph.quadric(j), self.camera.K, boxes[0])
+        measured = np.stack([box.corners for box in boxes])
+        return predicted is not None and bool(overlap(predicted[None], measured).max() >= self.settings.min_overlap)
+
+    def _vote_for(self, track: int, landmark: int) -> None:
+        decided = self._votes.add(track, landmark)
+        if decided is not None and not self._assignments.seen_apart(self._assignments.tracks[track], decided):
+            self.bind(track, decided)
+
+    def bind(self, track: int, j: int) -> None:
+        """The track is of this quadric."""
+        self._assignments.bind(track, j)
+        self._votes.forget(track)
+        self.counts["bound"] += 1
+
+    # -- quadrics found again -----------------------------------------------------------------------------------
+
+    def find(self, frame: Frame) -> Relocalised | None:
+        """Where in a loaded map a camera with these boxes is."""
+        return self._relocalised(frame, None, list(self._graph.landmarks))
+
+    def bind_found(self, frame: Frame, found: Relocalised) -> None:
+        """The boxes of the keyframe where the camera was found belong to the quadrics that it was found by."""
+        for n, j in found.pairs:
+            self.bind(frame.tracks[n], j)
+
+    def relocalise(self, k: int) -> None:
+        """Where the boxes show known objects from another pose than the predicted one, vote for those."""
+        frame = self._assignments.frames[k]
+        if self.settings.association == GIVEN or not any(self._is_recent(t) for t in frame.tracks):
+            return
+        # A young quadric is what is in question: it may be an old one, seen from where the camera is not.
+        old = [
+            j
+            for j in self._graph.landmarks
+            if self._graph.is_solved(j) and self._assignments.age(j) > self._assignments.YOUNG
+        ]
+        found = self._relocalised(frame, k, old)
+        if found is None:
+            return
+        self.counts["relocalised"] += 1
+        moved: dict[int, int] = {}
+        for n, j in found.pairs:
+            track = frame.tracks[n]
+            bound = self._assignments.tracks[track].quadric
+            if bound is None:
+                self._vote_for(track, j)
+            elif bound != j:
+                self._taken_for.setdefault((bound, j), set()).add(track)
+                if self._votes.add(~bound, j) == j:
+                    moved.update(self._mended(bound, j))
+        self._assignments.move(moved)
+        self.counts["moved"] += len(moved)
+
+    def _mended(self, bound: int, j: int) -> dict[int, int]:
+        """Tracks that are bound to one quadric and are of another: both are to be united, if images do not show both;
+        otherwise it was these tracks that were bound wrongly, as to the next bottle of a row, and they go to the
+        other."""
+        if not self._assignments.seen_beside(bound, j):
+            self._assignments.same.append((bound, j))
+            return {}
+        tracks = sorted(self._taken_for.pop((bound, j)))
+        self._votes.forget(~bound)
+        return {track: j for track in tracks if self._assignments.tracks[track].quadric == bound}
+
+    def _is_recent(self, track: int) -> bool:
+        """Whether a track is open, or bound to a young quadric."""
+        quadric = self._assignments.tracks[track].quadric
+        return quadric is None or self._assignments.age(quadric) <= self._assignments.YOUNG
+
+    def _relocalised(self, frame: Frame, k: int | None, known: list[int]) -> Relocalised | None:
+        """A better pose of keyframe k by these quadrics, or, if it is None, a pose of which nothing is known.
+
+        Its pairs are (row, id of the quadric).
+        """
+        if not known:
+            return None
+
+        def is_plausible(T_map_camera: Array) -> bool:
+            return k is None or self._graph.distance(k, T_map_camera) < self.FARTHEST
+
+        classes = np.array([self._assignments.class_of_quadric(j) for j in known])
+        wanted = [self._assignments.class_of_track(track) for track in frame.tracks]
+        found = relocalise(
+            None if k is None else self._graph.pose(k),
+            frame.boxes,
+            np.stack([self._graph.quadric(j) for j in known]),
+            np.reshape([classes == class_id for class_id in wanted], (-1, len(known))),
+            self.camera.K,
+            (self.camera.width, self.camera.height),
+            self.settings.robust_scale,
+            self.settings,
+            is_plausible,
+        )
+        return found and replace(found, pairs=[(n, known[m]) for n, m in found.pairs])
+
+    # -- the graph ----------------------------------------------------------------------------------------------
+
+    def spread_over_all(self) -> None:
+        """Covariances of boxes from the spread of all boxes of their quadric, not of those so far (eq. 4.3.1)."""
+        for j, landmark in self._graph.landmarks.items():
+            if not landmark.boxes:
+                continue
+            sigma = spread(np.stack([box.corners for box in landmark.boxes.values()])) * self.settings.covariance_scale
+            for k, box in list(landmark.boxes.items()):
+                self._graph.remove_box(k, j)
+                self._graph.add_box(k, j, replace(box, whitener=np.eye(4) / sigma))
+
+    def note(self, report: UpdateReport) -> None:
+        """Book what the graph took out: its boxes and tracks are open again."""
+        self.counts["repairs"] += bool(report.repaired)
+        for j in [j for j in self._assignments.classes if j not in self._graph.landmarks]:
+            self.counts["quadrics_removed"] += 1
+            self._assignments.forget(j)

@@ -1,0 +1,1 @@
+"""Ellipsoids, the boxes they project to, and boxes as they are measured."""

@@ -1,0 +1,1 @@
+"""The factor graph: factors, their noise, and ISAM2."""

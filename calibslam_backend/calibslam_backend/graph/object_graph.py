@@ -1,0 +1,399 @@
+"""The factor graph of camera poses and quadrics, solved incrementally by ISAM2 (document, eq. 2.3.5 and 4.3.3).
+
+Keys: x(k) pose of keyframe k; q(j) quadric j, a vector of centre and logarithmic shape (see `ellipsoid`); d(0) the
+drift of odometry (see `odometry_factor`), where its covariance is unknown.
+
+A graph never stays broken. A quadric that runs away is taken out, an update that fails is repaired by building
+the tree anew without the quadric at fault, and both are reported.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Hashable, Iterable
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+
+from calibslam_backend.geometry.box_measurement import BoxMeasurement
+from calibslam_backend.graph.box_correlation import LAGS, BoxCorrelation
+from calibslam_backend.graph.box_factor import box_factor, box_tangents, pose_information
+from calibslam_backend.graph.keys import D, poses_of, q, x
+from calibslam_backend.graph.measured import Landmark, Motion
+from calibslam_backend.graph.odometry_factor import DRIFT, motion_factor
+from calibslam_backend.graph.plausible import is_object, leapt
+from calibslam_backend.graph.prior import PriorSettings
+from calibslam_backend.graph.smoother import Smoother
+from calibslam_backend.odometry.motion_chain import dead_reckoning
+from calibslam_backend.odometry.motion_noise import MotionNoise
+from calibslam_msgs_py.measurements import Array
+from calibslam_msgs_py.settings import Settings, setting
+
+log = logging.getLogger(__name__)
+
+
+# The first keyframe is the origin of the map, whose axes are those of REP 103: x forward, y left, z up, while a
+# camera's are z forward, x right, y down.
+T_MAP_FIRST_CAMERA = np.array(
+    [[0.0, 0.0, 1.0, 0.0], [-1.0, 0.0, 0.0, 0.0], [0.0, -1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]]
+)
+
+
+@dataclass(frozen=True)
+class GraphSettings(Settings):
+    robust_scale: float = setting(2.0, "Mahalanobis distance beyond which a box is doubted", low=0.1, high=1e6)
+    box_correlation: bool = setting(
+        True, "whether boxes count less where the errors of an object's boxes in consecutive keyframes are alike"
+    )
+    robust_odometry: float = setting(3.5, "Mahalanobis distance beyond which a motion is doubted", low=0.1, high=1e6)
+    prior_sigma: float = setting(0.001, "first pose: it is the map's origin", unit="rad and m", low=1e-6)
+    relinearised: int = setting(60, "earlier keyframes, with every second new one, that may be relinearised", low=1)
+    relinearise_pose: float = setting(0.02, "change of a pose that asks for one", unit="rad and m", low=0.0)
+    relinearise_quadric: float = setting(0.03, "change of a quadric that asks for one", unit="m and log m", low=0.0)
+    young: int = setting(20, "keyframes during which a quadric is relinearised at once", low=0)
+
+
+@dataclass(frozen=True)
+class UpdateReport:
+    """What an update did: quadrics that ran away and are taken out with the next, and why the tree was built anew."""
+
+    removed: list[int]
+    repaired: str = ""
+
+
+class ObjectGraph:
+    """Poses x(0..n-1) in order, quadrics by id."""
+
+    REPAIR_ITERATIONS = 15
+    NEW_POSES = 5  # that are relinearised at once
+    IN_SIGHT = 10  # keyframes for which a quadric that was seen counts as one that will be seen again soon
+    FAR = 0.05  # [rad, m] that a pose may be from the base of its coordinates
+    WORTH_CHANGED = 0.1  # share by which a box's worth has to change for it to be relinearised
+    FOUND_SIGMA = 0.5  # [rad, m] of a pose found in a known map: its boxes say it better
+
+    def __init__(self, K: Array, settings: GraphSettings, priors: PriorSettings, noise: MotionNoise) -> None:
+        self._K = np.ascontiguousarray(K, float)
+        self._settings = settings
+        self._prior = priors.prior_covariance()
+        self._drift_covariance = noise.drift_covariance()
+        self._drifts = False
+        self._has_origin = False
+        self._motions: list[Motion] = []
+        self.landmarks: dict[int, Landmark] = {}
+        self.correlation = BoxCorrelation(settings.box_correlation)
+        self._origin, self._origin_sigma = T_MAP_FIRST_CAMERA, settings.prior_sigma
+        thresholds = {"x": (6, self.FAR), "q": (9, np.inf), "d": (DRIFT, np.inf)}
+        self._smoother = Smoother(thresholds, self._linearise_boxes)
+        self._linearised = np.zeros((0, 4, 4))  # of each pose where its factors were linearised
+        self._extracted = self._smoother.values, np.zeros((0, 4, 4))  # an estimate and its poses
+        self._next_turn = 0
+
+    # -- what is in it ------------------------------------------------------------------------------------------
+
+    @property
+    def size(self) -> int:
+        """Number of poses, those still to be updated included."""
+        return len(self._motions) + (1 if self._has_origin else 0)
+
+    def pose(self, k: int) -> Array:
+        """(4, 4) T_map_camera of keyframe k."""
+        return self._poses(self._smoother.values)[k].copy()
+
+    def poses(self) -> Array:
+        """(N, 4, 4) of all keyframes."""
+        return self._poses(self._smoother.values).copy()
+
+    def _poses(self, values: gtsam.Values) -> Array:
+        """(N, 4, 4) of all poses in their order, extracted once from each estimate."""
+        known, poses = self._extracted
+        if known is not values or len(poses) != self.size:
+            poses = poses_of(values)
+            self._extracted = values, poses
+        return poses
+
+    def odometry(self) -> tuple[Array, Array]:
+        """What odometry alone says: poses (N, 4, 4) and their covariances (N, 6, 6), from the same origin."""
+        steps = [(motion.measured, motion.covariance) for motion in self._motions]
+        return dead_reckoning(self._origin, np.eye(6) * self._origin_sigma**2, steps)
+
+    def drift(self) -> Array:
+        """(6,) velocity [rad/s, m/s] that odometry misses; zero while nothing is known of it."""
+        return np.asarray(self._smoother.values.atVector(D)) if self._drifts else np.zeros(DRIFT)
+
+    def predict(self, motion: Motion) -> Array:
+        """(4, 4) T_map_camera after a motion from the newest pose."""
+        correction = gtsam.Pose3.Expmap(motion.drifts * self.drift())
+        return np.asarray(self.pose(self.size - 1) @ motion.T @ correction.matrix())
+
+    def quadric(self, j: int) -> Array:
+        """(9,) centre and logarithmic shape."""
+        return np.asarray(self._smoother.values.atVector(q(j)))
+
+    def quadrics(self) -> tuple[list[int], Array]:
+        """Ids of all quadrics, in their order, and (M, 9) vectors."""
+        return self._quadrics(self._smoother.values)
+
+    def _quadrics(self, values: gtsam.Values) -> tuple[list[int], Array]:
+        ids = sorted(self.landmarks)
+        rows = np.reshape(gtsam.utilities.extractVectors(values, "q"), (-1, 9))
+        if len(rows) != len(ids):
+            raise RuntimeError(f"{len(rows)} quadrics in the tree, {len(ids)} in the graph")
+        return ids, np.ascontiguousarray(rows)  # GTSAM's are by columns
+
+    def is_solved(self, j: int) -> bool:
+        """Whether a quadric has gone through an update, and so has covariances."""
+        return self._smoother.has(("prior", j))
+
+    def pose_covariance(self, k: int) -> Array:
+        """(6, 6) [rotation, translation] of keyframe k in its body, with what the tree understates of errors that are
+        alike."""
+        return self.correlation.understated * self._smoother.marginal(x(k))
+
+    def distance(self, k: int, T_map_camera: Array) -> float:
+        """Mahalanobis distance of keyframe k from where it is estimated to be, if it were at this pose (4, 4); by the
+        tree's own covariance, as all gates."""
+        difference = gtsam.Pose3(self.pose(k)).localCoordinates(gtsam.Pose3(T_map_camera))
+        return float(np.sqrt(difference @ np.linalg.solve(self._smoother.marginal(x(k)), difference)))
+
+    def quadric_covariances(self) -> dict[int, Array]:
+        """For each quadric (9, 9) of its vector, like those of poses; its prior's where no update has been done yet."""
+        solved = [j for j in self.landmarks if self.is_solved(j)]
+        joint = self._smoother.joint([q(j) for j in solved]) if solved else None
+        own = {
+            j: np.asarray(joint.at(q(j), q(j))) if joint is not None and self.is_solved(j) else landmark.prior
+            for j, landmark in self.landmarks.items()
+        }
+        return {j: self.correlation.understated * covariance for j, covariance in own.items()}
+
+    def joint_covariances(self, k: int, quadrics: list[int]) -> list[Array]:
+        """For each of these quadrics (15, 15) of pose k and the quadric: columns of `box_of_visible_part`; the
+        tree's own, for gates."""
+        if not quadrics:
+            return []
+        joint = self._smoother.joint([x(k), *map(q, quadrics)])
+        pairs = [(x(k), q(j)) for j in quadrics]
+        return [np.block([[joint.at(a, b) for b in pair] for a in pair]) for pair in pairs]
+
+    # -- changes, which take effect with the next update --------------------------------------------------------
+
+    def add_origin(self, found: Array | None = None) -> None:
+        """The first pose: the origin of the map, or (4, 4) T_map_camera as found in a known map."""
+        self._has_origin = True
+        if found is not None:
+            self._origin, self._origin_sigma = found, self.FOUND_SIGMA
+        origin = gtsam.Pose3(self._origin)
+        noise = gtsam.noiseModel.Isotropic.Sigma(6, self._origin_sigma)
+        self._smoother.insert(x(0), origin)
+        self._linearised = self._origin[None]
+        self._smoother.add("origin", gtsam.PriorFactorPose3(x(0), origin, noise))
+
+    def add_pose(self, motion: Motion, guess: Array) -> int:
+        """The next pose, after a motion from the last one; returns its number.
+
+        The optimisation starts from `guess` (4, 4), its pose in the map.
+        """
+        k = self.size
+        self._motions.append(motion)
+        if motion.drifts and not self._drifts:
+            self._drifts = True
+            noise = gtsam.noiseModel.Gaussian.Covariance(self._drift_covariance)
+            self._smoother.insert(D, np.zeros(DRIFT))
+            self._smoother.add("drift", gtsam.PriorFactorVector(D, np.zeros(DRIFT), noise))
+        self._smoother.insert(x(k), gtsam.Pose3(guess))
+        self._linearised = np.append(self._linearised, guess[None], axis=0)
+        factor = motion_factor(
+            x(k - 1), x(k), D, motion.T, motion.covariance, motion.drifts, self._settings.robust_odometry
+        )
+        self._smoother.add(("motion", k), factor)
+        if k > self.NEW_POSES:
+            self._learn_motion(k - self.NEW_POSES)
+        return k
+
+    def add_quadric(self, j: int, vector: Array) -> None:
+        """A new quadric, first seen as this vector (9,)."""
+        self.add_known_quadric(j, vector, self._prior)
+
+    def add_known_quadric(self, j: int, vector: Array, covariance: Array) -> None:
+        """A quadric that is known as well as this covariance (9, 9) says."""
+        self.landmarks[j] = Landmark(self.size, covariance)
+        noise = gtsam.noiseModel.Gaussian.Covariance(covariance)
+        self._smoother.insert(q(j), vector)
+        self._smoother.add(("prior", j), gtsam.PriorFactorVector(q(j), vector, noise))
+
+    def add_box(self, k: int, j: int, box: BoxMeasurement) -> None:
+        """A box of quadric j in keyframe k, which must be its only one there."""
+        factor = box_factor(x(k), q(j), box, self._K, self._settings.robust_scale, self.correlation)
+        self._smoother.add(("box", k, j), factor)
+        self.landmarks[j].boxes[k] = box
+        self.landmarks[j].linearised[k] = self.quadric(j), self.correlation.worth
+
+    def remove_box(self, k: int, j: int) -> None:
+        """The box of quadric j in keyframe k is of something else."""
+        known = self.landmarks[j]
+        del known.boxes[k], known.linearised[k]
+        known.residuals.pop(k, None)
+        self._smoother.remove(("box", k, j))
+
+    def remove_quadric(self, j: int) -> None:
+        """Take a quadric out, with all that was measured of it."""
+        for k in self.landmarks.pop(j).boxes:
+            self._smoother.remove(("box", k, j))
+        self._smoother.remove(("prior", j))
+        self._smoother.forget(q(j))
+
+    # -- solving ------------------------------------------------------------------------------------------------
+
+    def update(self, turn: range = range(0)) -> UpdateReport:
+        """One step of ISAM2 with what is new; the keyframes of `turn` may be relinearised with it."""
+        self._relinearise(range(max(self.size - self.NEW_POSES, 0), self.size))
+        held = [x(k) for k in range(self.size - self.NEW_POSES) if k not in turn]
+        return self._step(lambda: self._smoother.update(self._last(), held))
+
+    def settle(self) -> UpdateReport | None:
+        """Relinearise those of the earlier keyframes whose turn it is; None if nothing has moved there."""
+        turn = self._turn()
+        return self.update(turn) if self._relinearise(turn) else None
+
+    def iterate(self) -> UpdateReport:
+        """One step of Gauss-Newton with everything linearised anew."""
+        return self._step(lambda: self._rebuild(self._smoother.values))
+
+    def _step(self, solve: Callable[[], None]) -> UpdateReport:
+        """Solve; what goes wrong is repaired and reported."""
+        before = self._smoother.values
+        poses = self._poses(before)
+        reason = ""
+        try:
+            solve()
+            if leapt(poses, self._poses(self._smoother.values)):
+                reason = "the trajectory jumped"
+        except RuntimeError as error:
+            reason = _first_sentence(error)
+        if reason:
+            log.warning("%s; optimising the whole graph from the estimate before", reason)
+            self._repair(before)
+        ids, vectors = self.quadrics()
+        plausible = is_object(vectors, self.pose(self.size - 1)[:3, 3])
+        removed = [j for j, fine in zip(ids, plausible, strict=True) if not fine]
+        for j in removed:
+            log.warning("quadric %d ran away and is taken out", j)
+            self.remove_quadric(j)
+        return UpdateReport(removed, reason)
+
+    def optimise(self) -> None:
+        """The batch optimum by Levenberg-Marquardt, from which the tree is built anew."""
+        self._rebuild(self._smoother.optimise(self._smoother.values))
+
+    def _rebuild(self, values: gtsam.Values) -> None:
+        """The tree anew, all of it linearised at these values."""
+        self._smoother.rebuild(values, self._last())
+        self._linearised = self.poses()
+        for j, landmark in self.landmarks.items():
+            landmark.linearised = dict.fromkeys(landmark.boxes, (values.atVector(q(j)), self.correlation.worth))
+
+    def _linearise_boxes(self, names: Iterable[Hashable], values: gtsam.Values) -> dict[Hashable, gtsam.JacobianFactor]:
+        """The tangents of those of these factors that are boxes."""
+        ids, vectors = self._quadrics(values)
+        rows = {j: row for row, j in enumerate(ids)}
+        boxes = [name for name in names if isinstance(name, tuple) and name[0] == "box"]
+        tangents, residuals = box_tangents(
+            [(x(k), q(j)) for _, k, j in boxes],
+            self._poses(values)[[k for _, k, _ in boxes]],
+            vectors[[rows[j] for _, _, j in boxes]],
+            [self.landmarks[j].boxes[k] for _, k, j in boxes],
+            self._K,
+            self._settings.robust_scale,
+            self.correlation.worth,
+        )
+        self._learn_correlation(boxes, residuals)
+        return dict(zip(boxes, tangents, strict=True))
+
+    def _learn_correlation(self, boxes: list[tuple[str, int, int]], residuals: Array) -> None:
+        """From the residuals (N, 4) of these boxes and of those of the same quadrics in keyframes before."""
+        for (_, k, j), residual in zip(boxes, residuals, strict=True):
+            self.landmarks[j].residuals[k] = residual.copy()  # a view would keep those of all alive
+        for lag in LAGS:
+            rows = [n for n, (_, k, j) in enumerate(boxes) if k - lag in self.landmarks[j].residuals]
+            if rows:
+                before = np.stack([self.landmarks[j].residuals[k - lag] for _, k, j in (boxes[n] for n in rows)])
+                self.correlation.learn(before, residuals[rows], lag)
+
+    def _learn_motion(self, k: int) -> None:
+        """What boxes and odometry say of the motion to keyframe k, which is old enough for its boxes to be known."""
+        seen = [j for j, known in self.landmarks.items() if k in known.boxes]
+        information = pose_information(
+            self.pose(k), [self.quadric(j) for j in seen], [self.landmarks[j].boxes[k] for j in seen], self._K
+        )
+        self.correlation.learn_motion(information, self._motions[k - 1].covariance)
+
+    def _last(self) -> list[int]:
+        """Quadrics in sight, the newest pose and the drift are eliminated last: the next update will touch them again.
+
+        All quadrics would make the root of the tree grow with the map, and with it the cost of every update.
+        """
+        drift = [D] if self._drifts else []
+        recent = range(max(self.size - self.IN_SIGHT, 0), self.size)
+        in_sight = [j for j, known in self.landmarks.items() if any(k in known.boxes for k in recent)]
+        return [*map(q, in_sight), x(self.size - 1), *drift]
+
+    def _turn(self) -> range:
+        """The earlier keyframes that are looked at now."""
+        start = self._next_turn if self._next_turn < self.size - self.NEW_POSES else 0
+        self._next_turn = start + self._settings.relinearised
+        return range(start, min(self._next_turn, self.size - self.NEW_POSES))
+
+    def _relinearise(self, turn: range) -> int:
+        """Linearise anew the factors of these keyframes, and the boxes of young quadrics, whose variables have moved.
+
+        Returns how many.
+        """
+        s = self._settings
+        poses, worth = self._poses(self._smoother.values), self.correlation.worth
+        moved = np.abs(poses - self._linearised).max(axis=(1, 2)) > s.relinearise_pose
+        names: dict[Hashable, None] = {}  # each once, in a fixed order
+        for k in turn:
+            if moved[k]:
+                names["motion", k] = names["motion", k + 1] = None
+        for j, vector in zip(*self.quadrics(), strict=True):
+            landmark = self.landmarks[j]
+            young = self.size - landmark.born <= s.young
+            for k in landmark.boxes if young else [k for k in turn if k in landmark.boxes]:
+                where, then = landmark.linearised[k]
+                if (
+                    moved[k]
+                    or abs(worth - then) > self.WORTH_CHANGED * worth
+                    or np.abs(vector - where).max() > s.relinearise_quadric
+                ):
+                    landmark.linearised[k] = vector, worth
+                    names["box", k, j] = None
+        for k in turn:
+            if moved[k]:
+                self._linearised[k] = poses[k]
+        for name in names:
+            self._smoother.renew(name)
+        return len(names)
+
+    def _repair(self, before: gtsam.Values) -> None:
+        """Optimise the whole graph with damping from an estimate that was good, and build the tree anew.
+
+        If even that fails, quadrics are given up, the youngest first.
+        """
+        before = gtsam.Values(before)
+        while True:
+            try:
+                values = self._smoother.optimise(before, self.REPAIR_ITERATIONS)
+                self._rebuild(values)
+                return
+            except RuntimeError as error:
+                if not self.landmarks:
+                    raise
+                youngest = max(self.landmarks, key=lambda j: self.landmarks[j].born)
+                log.warning("%s; giving up quadric %d", _first_sentence(error), youngest)
+                self.remove_quadric(youngest)
+                before.erase(q(youngest))
+
+
+def _first_sentence(error: RuntimeError) -> str:
+    """GTSAM's messages are pages long."""
+    return " ".join(str(error).split("Thrown when")[0].split())

@@ -1,0 +1,1 @@
+"""How quadrics begin, are united, and end."""

@@ -1,0 +1,1 @@
+"""Maps, metrics, plots, and the folder of a run."""

@@ -1,0 +1,120 @@
+"""Pictures of a run: map and trajectory from above, and how the errors compare with their stated covariance."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import matplotlib
+import numpy as np
+
+from calibslam_backend.output.metrics import NoGroundTruth, Trajectory, alignment, interpolated
+from calibslam_backend.output.object_map import ObjectMap
+from calibslam_msgs_py.measurements import Array
+
+matplotlib.use("Agg")
+from matplotlib import pyplot as plt
+from matplotlib.axes import Axes
+from matplotlib.patches import Ellipse
+
+MARGIN = 1.5  # [m] around the trajectories
+CONFIDENCE = 2.0  # standard deviations that ellipses and bands show
+
+
+def plot_run(path: Path, title: str, result: ObjectMap, odometry: Array, truth: Trajectory | None) -> None:
+    """Trajectories and objects from above, and with ground truth the position error over time.
+
+    Args:
+        path: of the PNG.
+        title: of the picture.
+        result: what was estimated.
+        odometry: (N, 4, 4) the same keyframes by odometry alone.
+        truth: in any frame; None: not known.
+    """
+    figure, axes = plt.subplots(
+        1, 2 if truth is not None else 1, figsize=(14 if truth is not None else 8, 7), squeeze=False, dpi=110
+    )
+    top = axes[0, 0]
+    estimate = Trajectory(np.array(result.stamps), result.poses)
+    if truth is not None:
+        try:
+            T_map_world = np.linalg.inv(alignment(estimate, truth))
+        except NoGroundTruth:
+            truth = None
+        else:
+            inside = (truth.stamps >= result.stamps[0]) & (truth.stamps <= result.stamps[-1])
+            true = (T_map_world @ truth.poses[inside])[:, :3, 3]
+            top.plot(true[:, 0], true[:, 1], "-", color="0.2", linewidth=2.5, alpha=0.6, label="ground truth")
+    top.plot(*odometry[:, :2, 3].T, ":", color="tab:orange", linewidth=1.5, label="odometry alone")
+    top.plot(*result.poses[:, :2, 3].T, "-", color="tab:blue", linewidth=1.5, label="estimate")
+    _objects(top, result)
+    top.plot(*result.poses[0, :2, 3], "o", color="tab:green", label="start")
+    top.set(xlabel="x forward [m]", ylabel="y left [m]", title=f"{title}: seen from above")
+    top.set_aspect("equal", adjustable="box")
+    # An object whose place is hardly known must not shrink everything else to a dot.
+    everything = np.concatenate([odometry[:, :2, 3], result.poses[:, :2, 3]])
+    low, high = everything.min(axis=0) - MARGIN, everything.max(axis=0) + MARGIN
+    top.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
+    top.legend(loc="best", fontsize=9)
+    top.grid(alpha=0.3)
+    if truth is not None:
+        _errors(axes[0, 1], estimate, result.covariances, odometry, truth)
+    elif axes.shape[1] > 1:
+        axes[0, 1].set_axis_off()
+    figure.tight_layout()
+    figure.savefig(path, metadata={"Software": None})
+    plt.close(figure)
+
+
+def _objects(axes: Axes, result: ObjectMap) -> None:
+    """Outlines and names; the legend names the first of each kind of ellipse, the others have names that it skips."""
+    outline, place = "object", f"{CONFIDENCE:g} sigma of its centre"
+    for quadric in result.quadrics:
+        R = quadric.T_map_object[:3, :3]
+        shadow = (R * quadric.radii**2) @ R.T  # the outline from above is the ellipse of its upper left block
+        centre = quadric.T_map_object[:2, 3]
+        axes.add_patch(
+            _ellipse(centre, shadow[:2, :2], label=outline, facecolor="tab:purple", alpha=0.25, edgecolor="tab:purple")
+        )
+        outline = "_"
+        if np.isfinite(quadric.covariance).all():
+            sigma = (R @ quadric.covariance[3:6, 3:6] @ R.T)[:2, :2] * CONFIDENCE**2
+            axes.add_patch(_ellipse(centre, sigma, label=place, fill=False, edgecolor="black", linewidth=0.8))
+            place = "_"
+        axes.annotate(
+            quadric.class_id, (centre[0], centre[1]), (0.0, 4.0), textcoords="offset points",
+            fontsize=7, ha="center", va="bottom", annotation_clip=True,
+        )  # fmt: skip
+
+
+def _ellipse(centre: Array, shape: Array, **style: object) -> Ellipse:
+    """The set (p - centre)^T shape^-1 (p - centre) <= 1."""
+    values, vectors = np.linalg.eigh(shape)
+    width, height = 2.0 * np.sqrt(np.maximum(values, 0.0))
+    return Ellipse(
+        tuple(centre),
+        width,
+        height,
+        angle=float(np.degrees(np.arctan2(vectors[1, 0], vectors[0, 0]))),
+        **style,
+    )
+
+
+def _errors(axes: Axes, estimate: Trajectory, covariances: Array, odometry: Array, truth: Trajectory) -> None:
+    covered, true = interpolated(truth, estimate.stamps)
+    if np.count_nonzero(covered) < 2:
+        axes.set_axis_off()
+        return
+    seconds = (np.asarray(estimate.stamps) - estimate.stamps[0])[covered] * 1e-9
+    true = (estimate.poses[covered][0] @ np.linalg.inv(true[0]) @ true)[:, :3, 3]
+    for poses, colour, style, name in (
+        (odometry, "tab:orange", ":", "odometry alone"),
+        (estimate.poses, "tab:blue", "-", "estimate"),
+    ):
+        error = np.linalg.norm(poses[covered][:, :3, 3] - true, axis=1)
+        axes.plot(seconds, error, style, color=colour, label=f"error, {name}")
+    spread = np.sqrt(np.trace(covariances[covered][:, 3:, 3:], axis1=1, axis2=2))
+    axes.fill_between(seconds, 0.0, CONFIDENCE * spread, color="tab:blue", alpha=0.15,
+                      label=f"{CONFIDENCE:g} sigma of the estimate, as stated")  # fmt: skip
+    axes.set(xlabel="time [s]", ylabel="position error [m]", title="error, tied to the truth at the start")
+    axes.legend(loc="upper left", fontsize=9)
+    axes.grid(alpha=0.3)

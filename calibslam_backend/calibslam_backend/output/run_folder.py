@@ -1,0 +1,117 @@
+"""A RUN folder: `trajectory.tum`, `map.json`, `metrics.json`, `trajectory.png`; `run.mcap` is written beside them."""
+
+from __future__ import annotations
+
+import json
+import resource
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from calibslam_backend.output.metrics import NoGroundTruth, Trajectory, association_scores, ate, position_nees, rpe
+from calibslam_backend.output.object_map import ObjectMap, tum_lines
+from calibslam_backend.output.plots import plot_run
+from calibslam_msgs_py.measurements import Array
+
+
+@dataclass
+class RunRecord:
+    """What happened in a run, beside its result.
+
+    Attributes:
+        odometry: poses (N, 4, 4) of the keyframes by odometry alone, and covariances (N, 6, 6).
+        online: (N, 4, 4) each keyframe as known right after it.
+        seconds: (N,) each keyframe's update.
+        between: (N,) the longest that an image since the keyframe before took.
+        boxes_used, boxes_rejected: numbers.
+        box_correlation: of the errors of an object's boxes in consecutive keyframes.
+        rejected: why, and other counts.
+        associations: quadric and true identity of each box of a keyframe.
+        wall_s, sequence_s: duration of the run and of the recording.
+        recording: absolute path of the bag.
+        calibrator: file that gave boxes their covariances; None: the default, or the boxes had them.
+        settings: that were used, for the record.
+    """
+
+    odometry: tuple[Array, Array]
+    online: Array
+    seconds: Array
+    between: Array
+    boxes_used: int
+    boxes_rejected: int
+    box_correlation: float
+    rejected: dict[str, int]
+    associations: Sequence[tuple[int | None, str]]
+    wall_s: float
+    sequence_s: float
+    recording: str = ""
+    calibrator: str | None = None
+    settings: dict[str, Any] = field(default_factory=dict)
+
+
+def accuracy(
+    stamps: Sequence[int], poses: Array, covariances: Array, truth: Trajectory | None, prefix: str = ""
+) -> dict[str, float | None]:
+    """ATE, RPE and NEES of a trajectory as entries of metrics.json; None where there is no ground truth."""
+    estimate = Trajectory(np.array(stamps), poses)
+    try:
+        if truth is None:
+            raise NoGroundTruth("none given")
+        return {
+            f"{prefix}ate_m": ate(estimate, truth),
+            f"{prefix}rpe_m": rpe(estimate, truth),
+            f"{prefix}nees_position": position_nees(estimate, covariances, truth),
+        }
+    except NoGroundTruth:
+        return {f"{prefix}{name}": None for name in ("ate_m", "rpe_m", "nees_position")}
+
+
+def milliseconds(seconds: Array) -> dict[str, float | None]:
+    """Median, 99th percentile and maximum [ms]; None of nothing."""
+    if not len(seconds):
+        return dict.fromkeys(("p50", "p99", "max"))
+    p50, p99, longest = np.percentile(np.asarray(seconds) * 1e3, [50, 99, 100])
+    return {"p50": float(p50), "p99": float(p99), "max": float(longest)}
+
+
+def metrics_of(result: ObjectMap, record: RunRecord, truth: Trajectory | None) -> dict[str, Any]:
+    """The content of metrics.json."""
+    scores = association_scores(record.associations)
+    online = accuracy(result.stamps, record.online, result.covariances, truth, "online_")
+    return {
+        **accuracy(result.stamps, result.poses, result.covariances, truth),
+        **accuracy(result.stamps, *record.odometry, truth, "odometry_"),
+        "online_ate_m": online["online_ate_m"],
+        "keyframes": len(result.stamps),
+        "objects": len(result.quadrics),
+        "boxes_used": record.boxes_used,
+        "boxes_rejected": record.boxes_rejected,
+        "box_correlation": record.box_correlation,
+        "rejected": record.rejected,
+        "update_ms": milliseconds(record.seconds),
+        "between_ms": milliseconds(record.between),
+        "wall_s": record.wall_s,
+        "sequence_s": record.sequence_s,
+        "peak_rss_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0,
+        **({"association": vars(scores)} if scores else {}),
+        "recording": record.recording,
+        "calibrator": record.calibrator,
+        "settings": record.settings,
+    }
+
+
+def write_run(
+    folder: Path, title: str, result: ObjectMap, record: RunRecord, truth: Trajectory | None
+) -> dict[str, Any]:
+    """Write everything but `run.mcap`; returns the metrics."""
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / "trajectory.tum").write_text(tum_lines(result.stamps, result.poses), encoding="utf-8")
+    result.save(folder / "map.json")
+    metrics = metrics_of(result, record, truth)
+    (folder / "metrics.json").write_text(json.dumps(metrics, indent=1) + "\n", encoding="utf-8")
+    if result.stamps:
+        plot_run(folder / "trajectory.png", title, result, record.odometry[0], truth)
+    return metrics

@@ -1,0 +1,1 @@
+"""Parts of the node `backend`: conversions, publishers, services, diagnostics."""

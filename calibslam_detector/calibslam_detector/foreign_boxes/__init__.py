@@ -1,0 +1,1 @@
+"""Covariances for the boxes of somebody else's detector."""

@@ -1,0 +1,1 @@
+"""Images in, pictures for a person out."""

@@ -1,0 +1,1 @@
+"""The network: boxes and their covariances from images."""

@@ -1,0 +1,90 @@
+"""An image in, boxes with covariances out."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from calibslam_detector.model import weights_file
+from calibslam_detector.model.network import CalibratedDetector
+from calibslam_detector.training.coco_data import to_tensor
+from calibslam_msgs_py.covariance import symmetric
+from calibslam_msgs_py.measurements import Boxes
+from calibslam_msgs_py.settings import Settings, setting
+
+DEVICES = ("auto", "cpu", "cuda")
+
+
+class DeviceError(ValueError):
+    """A device that is not there."""
+
+
+@dataclass(frozen=True)
+class DetectorSettings(Settings):
+    """What is detected, and where that is computed."""
+
+    score_threshold: float = setting(0.5, "boxes of a smaller score are left out", low=0.0, high=1.0)
+    device: str = setting("auto", "auto: CUDA where it is, else CPU", choices=DEVICES)
+    threads: int = setting(0, "of the CPU; 0: one less than it has cores, for the other nodes", low=0)
+
+
+class Detector:
+    """Detects with a network.
+
+    Args:
+        model: the network.
+        settings: what is detected, and where.
+
+    Raises:
+        DeviceError: there is no CUDA.
+    """
+
+    def __init__(self, model: CalibratedDetector, settings: DetectorSettings) -> None:
+        self.device = _device(settings.device)
+        # One thread too many costs more than one too few, since they wait for each other: on 2 busy cores an image
+        # takes 0.6 s with two and 0.14 s with one; where nothing else runs 0.06 s and 0.09 s.
+        others = max(len(os.sched_getaffinity(0)) - 1, 1)
+        torch.set_num_threads(settings.threads or min(others, torch.get_num_threads()))
+        self.class_names, self.boxes = model.class_names, model.boxes
+        self._model = model.to(self.device).eval()
+        self._model.detector.roi_heads.score_thresh = settings.score_threshold
+
+    @classmethod
+    def from_file(cls, path: Path, settings: DetectorSettings) -> Detector:
+        """With the weights of a file.
+
+        Raises:
+            WeightsError: they cannot be used.
+            DeviceError: there is no CUDA.
+        """
+        return cls(weights_file.load(path), settings)
+
+    def __call__(self, image: np.ndarray, stamp: int = 0, frame_id: str = "camera") -> tuple[Boxes, float]:
+        """Boxes, the best first, of an image (H, W, 3) uint8 RGB that was taken at `stamp` [ns], and how strange it is:
+        covariances are calibrated for images like those learnt from, of which 95 % have a strangeness below 1.
+        """
+        with torch.inference_mode():
+            (found,) = self._model.detect([to_tensor(image).to(self.device)])
+        covariances = found["covariances"].double().cpu().numpy()
+        boxes = Boxes(
+            stamp=stamp,
+            width=image.shape[1],
+            height=image.shape[0],
+            corners=found["boxes"].double().cpu().numpy(),
+            covariances=symmetric(covariances),
+            class_ids=tuple(self.class_names[int(label) - 1] for label in found["labels"]),
+            scores=found["scores"].double().cpu().numpy(),
+            object_ids=("",) * len(covariances),
+            frame_id=frame_id,
+        )
+        return boxes, float(found["strangeness"])
+
+
+def _device(name: str) -> torch.device:
+    if name == "cuda" and not torch.cuda.is_available():
+        raise DeviceError("there is no CUDA device that torch can use; set device to auto or cpu")
+    return torch.device("cuda" if name == "cuda" or (name == "auto" and torch.cuda.is_available()) else "cpu")

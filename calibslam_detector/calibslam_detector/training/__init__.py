@@ -1,0 +1,1 @@
+"""How the detector and its covariance head are trained."""

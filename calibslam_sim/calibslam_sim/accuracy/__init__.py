@@ -1,0 +1,1 @@
+"""How far objects and motions are from the truth."""

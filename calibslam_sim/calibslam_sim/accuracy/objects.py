@@ -1,0 +1,88 @@
+"""How well a map of ellipsoids agrees with the true ones."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.optimize import linear_sum_assignment
+
+from calibslam_backend.geometry.ellipsoid import Ellipsoid
+from calibslam_msgs_py.measurements import Array
+from calibslam_sim.simulation.sampling import unit_cube
+
+MAX_CENTRE_DISTANCE = 0.5  # [m] farther apart, an estimate is not of this object
+IOU_POINTS = 20_000
+
+
+@dataclass(frozen=True)
+class ObjectAccuracy:
+    """Agreement of a map with the truth.
+
+    Attributes:
+        true: number of objects there are.
+        estimated: number of objects in the map.
+        matched: number of pairs, each the nearest that is left, at most `MAX_CENTRE_DISTANCE` apart.
+        centre_m: mean distance of the centres of pairs [m]; NaN without any pair, as those below.
+        radii: mean error of the semi-axes of pairs, compared by size, as a share of the true ones.
+        iou: mean intersection over union of the volumes of pairs.
+    """
+
+    true: int
+    estimated: int
+    matched: int
+    centre_m: float
+    radii: float
+    iou: float
+
+
+def object_accuracy(estimated: Sequence[Ellipsoid], true: Sequence[Ellipsoid]) -> ObjectAccuracy:
+    """Compare a map, already aligned with the world, to the objects of the world."""
+    pairs = matches(estimated, true)
+    centres = [float(np.linalg.norm(_centre(estimated[i]) - _centre(true[j]))) for i, j in pairs]
+    radii = [float(np.mean(np.abs(np.sort(estimated[i].radii) / np.sort(true[j].radii) - 1.0))) for i, j in pairs]
+    overlaps = [iou(estimated[i], true[j]) for i, j in pairs]
+    return ObjectAccuracy(len(true), len(estimated), len(pairs), _mean(centres), _mean(radii), _mean(overlaps))
+
+
+def matches(estimated: Sequence[Ellipsoid], true: Sequence[Ellipsoid]) -> list[tuple[int, int]]:
+    """Pairs (estimated, true) of least total distance of centres, none above `MAX_CENTRE_DISTANCE`."""
+    if not estimated or not true:
+        return []
+    a = np.array([_centre(e) for e in estimated])
+    b = np.array([_centre(e) for e in true])
+    distances = np.linalg.norm(a[:, None] - b[None, :], axis=2)
+    # Cut off, so that one far estimate does not push others away from their objects.
+    rows, columns = linear_sum_assignment(np.minimum(distances, MAX_CENTRE_DISTANCE))
+    return [(int(i), int(j)) for i, j in zip(rows, columns, strict=True) if distances[i, j] < MAX_CENTRE_DISTANCE]
+
+
+def iou(a: Ellipsoid, b: Ellipsoid) -> float:
+    """Intersection over union of two volumes, from points spread over the box around both."""
+    boxes = [_bounds(a), _bounds(b)]
+    low = np.minimum(boxes[0][0], boxes[1][0])
+    high = np.maximum(boxes[0][1], boxes[1][1])
+    points = low + unit_cube(IOU_POINTS) * (high - low)
+    in_a, in_b = _contains(a, points), _contains(b, points)
+    union = np.count_nonzero(in_a | in_b)
+    return float(np.count_nonzero(in_a & in_b) / union) if union else 0.0
+
+
+def _centre(ellipsoid: Ellipsoid) -> Array:
+    return np.asarray(ellipsoid.T_world_object[:3, 3])
+
+
+def _bounds(ellipsoid: Ellipsoid) -> tuple[Array, Array]:
+    axes = ellipsoid.T_world_object[:3, :3] * ellipsoid.radii
+    reach = np.sqrt(np.sum(axes * axes, axis=1))
+    return _centre(ellipsoid) - reach, _centre(ellipsoid) + reach
+
+
+def _contains(ellipsoid: Ellipsoid, points: Array) -> np.ndarray:
+    local = (points - _centre(ellipsoid)) @ ellipsoid.T_world_object[:3, :3] / ellipsoid.radii
+    return np.asarray(np.sum(local * local, axis=1) <= 1.0)
+
+
+def _mean(values: list[float]) -> float:
+    return float(np.mean(values)) if values else float("nan")

@@ -1,0 +1,1 @@
+"""Images and depth images of the simulated desk."""

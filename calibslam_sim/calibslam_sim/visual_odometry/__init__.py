@@ -1,0 +1,1 @@
+"""Odometry from images with depth."""
