@@ -16,7 +16,7 @@ from calibslam_backend.association.matching import ESTIMATED, GIVEN
 from calibslam_backend.estimator import Estimator, EstimatorSettings
 from calibslam_backend.geometry.ellipsoid import Ellipsoid
 from calibslam_backend.graph.noise import FIXED, QUADRICSLAM
-from calibslam_backend.graph.object_graph import T_MAP_FIRST_CAMERA, ObjectGraph
+from calibslam_backend.graph.object_graph import T_MAP_FIRST_CAMERA
 from calibslam_backend.keyframe import Keyframe
 from calibslam_backend.output import metrics
 from calibslam_backend.output.object_map import ObjectMap, tum_lines

@@ -23,9 +23,9 @@ from tqdm import tqdm
 
 from calibslam_detector.calibration import metrics
 from calibslam_detector.calibration.reliability import plot, reliability
+from calibslam_detector.images.coco_data import BOX_KEYS, CocoData, DataError, load_coco_data, read_image
 from calibslam_detector.model.detector import Detector, DetectorSettings, DeviceError
 from calibslam_detector.model.weights_file import SHIPPED, WeightsError
-from calibslam_detector.training.coco_data import BOX_KEYS, CocoData, DataError, load_coco_data, read_image
 from calibslam_detector.training.matching import free_of_border, match
 from calibslam_msgs_py.command import command
 from calibslam_msgs_py.measurements import Array, Boxes

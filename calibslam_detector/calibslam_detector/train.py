@@ -19,10 +19,10 @@ from typing import Any
 import torch
 
 from calibslam_detector.calibration.residuals import CalibrationError
+from calibslam_detector.images.coco_data import BOX_KEYS, CocoData, DataError, load_coco_data
 from calibslam_detector.model import weights_file
 from calibslam_detector.model.network import ARCHITECTURES, CalibratedDetector
 from calibslam_detector.model.weights_file import WeightsError
-from calibslam_detector.training.coco_data import BOX_KEYS, CocoData, DataError, load_coco_data
 from calibslam_detector.training.covariance_task import LOSSES, covariance_task, find_examples, stored_examples
 from calibslam_detector.training.detector_task import Processes, detector_task
 from calibslam_detector.training.training_loop import Interrupted, LoopSettings, TrainingError, optimise

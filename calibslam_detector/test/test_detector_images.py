@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from calibslam_detector.evaluate_detector import SUM, Errors, calibration_metrics, errors_of_whole_objects, precision
+from calibslam_detector.images.coco_data import CocoData, ImageTruth
 from calibslam_detector.images.image_conversion import ENCODINGS, decode_compressed, decode_raw, encode_jpeg
 from calibslam_detector.images.overlay import class_colour, draw_overlay, ellipse_axes
-from calibslam_detector.training.coco_data import CocoData, ImageTruth
 from calibslam_detector.training.matching import free_of_border, match, overlaps
 from calibslam_msgs_py.measurements import Boxes, InvalidMeasurement
 

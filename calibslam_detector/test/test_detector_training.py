@@ -16,11 +16,11 @@ import pytest
 import torch
 
 from calibslam_detector import evaluate_detector, train
+from calibslam_detector.images.coco_data import DataError, TrainingImages, load_coco_data
 from calibslam_detector.model import weights_file
 from calibslam_detector.model.network import CalibratedDetector
 from calibslam_detector.model.region_cues import CUES
 from calibslam_detector.model.weights_file import WeightsError
-from calibslam_detector.training.coco_data import DataError, TrainingImages, load_coco_data
 from calibslam_detector.training.covariance_task import LOSSES, Examples, covariance_task
 from calibslam_detector.training.training_loop import LoopSettings, Task, TrainingError, batch_of, optimise
 

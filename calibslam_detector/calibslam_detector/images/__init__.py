@@ -1,1 +1,1 @@
-"""Images in, pictures for a person out."""
+"""Images in, from messages and data sets; pictures for a person out."""

@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from calibslam_detector.images.coco_data import to_tensor
 from calibslam_detector.model import weights_file
 from calibslam_detector.model.network import CalibratedDetector
-from calibslam_detector.training.coco_data import to_tensor
 from calibslam_msgs_py.covariance import symmetric
 from calibslam_msgs_py.measurements import Boxes
 from calibslam_msgs_py.settings import Settings, setting

@@ -23,11 +23,11 @@ from torchvision.models.mobilenetv3 import mobilenet_v3_large
 from torchvision.ops import batched_nms, clip_boxes_to_image, remove_small_boxes
 from torchvision.ops.misc import FrozenBatchNorm2d
 
+from calibslam_detector.images.coco_data import BOX_KEYS
 from calibslam_detector.model.box_covariance import corner_covariances, rescaled
 from calibslam_detector.model.covariance_head import CovarianceHead
 from calibslam_detector.model.familiarity import Familiarity, descriptor
 from calibslam_detector.model.region_cues import LEAST_NEIGHBOUR, Chosen, agreement, geometry, hiding, second_look
-from calibslam_detector.training.coco_data import BOX_KEYS
 
 # The compact network: a quarter of torchvision's MobileNet detector, and finer levels for small things.
 COMPACT_CHANNELS, COMPACT_FEATURES = 128, 256  # of a level, of a region

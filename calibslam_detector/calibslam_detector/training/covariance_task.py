@@ -19,10 +19,10 @@ from tqdm import tqdm
 from calibslam_detector.calibration.f_cal import FCal
 from calibslam_detector.calibration.f_cal_cramer import FCalCramer
 from calibslam_detector.calibration.losses import CalibrationLoss, GaussianNLL
+from calibslam_detector.images.coco_data import CocoData, read_image, to_tensor
 from calibslam_detector.model import weights_file
 from calibslam_detector.model.box_covariance import decoupled
 from calibslam_detector.model.network import CalibratedDetector, Regions
-from calibslam_detector.training.coco_data import CocoData, read_image, to_tensor
 from calibslam_detector.training.matching import free_of_border, match
 from calibslam_detector.training.training_loop import LoopSettings, Task, batch_of
 

@@ -12,8 +12,8 @@ from torch import Tensor, nn
 from torch.nn.parallel import DistributedDataParallel
 from torch.utils.data import DataLoader
 
+from calibslam_detector.images.coco_data import CocoData, Sample, TrainingImages
 from calibslam_detector.model.network import CalibratedDetector
-from calibslam_detector.training.coco_data import CocoData, Sample, TrainingImages
 from calibslam_detector.training.training_loop import LoopSettings, Task, batch_of
 
 

@@ -1,4 +1,4 @@
-"""Ellipsoids and the boxes they project to, against derivatives, sampled surfaces and sampled covariances."""
+"""The boxes that ellipsoids project to, against derivatives and sampled surfaces."""
 
 from __future__ import annotations
 
@@ -8,16 +8,10 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from numerical import assert_jacobians
-from scipy.spatial.transform import Rotation
 
 from calibslam_backend.geometry.ellipsoid import (
     Ellipsoid,
-    covariance_of_pose_and_radii,
-    covariance_of_vector,
-    matrix_from_vector,
-    vector_from_matrix,
 )
-from calibslam_backend.geometry.shape import _eigen, shapes
 from calibslam_backend.geometry.visible_box import (
     ALL_EDGES,
     POSE,
@@ -185,137 +179,3 @@ def test_what_is_not_wholly_in_front_has_no_box() -> None:
 def test_an_image_without_borders_is_the_default() -> None:
     assert not np.isfinite(UNBOUNDED).any()
     np.testing.assert_array_equal(image_bounds(640, 480), [0.0, 0.0, 640.0, 480.0])
-
-
-# -- the vector (t, L) ----------------------------------------------------------------------------------------------
-
-
-@settings(max_examples=100, deadline=None, derandomize=True)
-@given(a=tilts, b=tilts, c=tilts, r=st.tuples(radii, radii, radii), t=st.tuples(tilts, tilts, tilts))
-def test_vector_and_ellipsoid_are_the_same_set(
-    a: float, b: float, c: float, r: tuple[float, float, float], t: tuple[float, float, float]
-) -> None:
-    """The axes may come back in another order, but S = R diag(r^2) R^T is the same."""
-    T = gtsam.Pose3(gtsam.Rot3.RzRyRx(a, b, c), np.array(t)).matrix()
-    given_one = Ellipsoid(T, np.array(r))
-    vector = given_one.vector()
-    back = Ellipsoid.from_vector(vector)
-    np.testing.assert_allclose(np.sort(r), back.radii, rtol=1e-9)
-    R = back.T_world_object[:3, :3]
-    np.testing.assert_allclose(np.linalg.det(R), 1.0, rtol=1e-9)
-    shapes = [(e.T_world_object[:3, :3] * e.radii**2) @ e.T_world_object[:3, :3].T for e in (given_one, back)]
-    np.testing.assert_allclose(shapes[0], shapes[1], atol=1e-9)
-    np.testing.assert_allclose(back.vector(), vector, atol=1e-9)
-
-
-def test_logarithmic_shapes_keep_their_norm() -> None:
-    """So that one standard deviation for all six components is a prior that knows no direction."""
-    rng = np.random.default_rng(0)
-    for _ in range(20):
-        A = rng.normal(size=(3, 3))
-        L = A + A.T
-        v = vector_from_matrix(L)
-        np.testing.assert_allclose(np.linalg.norm(v), np.linalg.norm(L))
-        np.testing.assert_allclose(matrix_from_vector(v), L)
-        R = Rotation.random(rng=rng).as_matrix()
-        np.testing.assert_allclose(np.linalg.norm(vector_from_matrix(R @ L @ R.T)), np.linalg.norm(v))
-
-
-def test_the_prior_does_not_depend_on_how_the_map_is_turned() -> None:
-    """Two ellipsoids, turned together, stay as far apart in units of the prior."""
-    rng = np.random.default_rng(1)
-    for _ in range(20):
-        a, b = (
-            Ellipsoid(gtsam.Pose3(gtsam.Rot3(Rotation.random(rng=rng).as_matrix()), rng.normal(size=3)).matrix(), r)
-            for r in np.exp(rng.normal(-1.5, 0.5, size=(2, 3)))
-        )
-        T = np.eye(4)
-        T[:3, :3] = Rotation.random(rng=rng).as_matrix()
-        turned = [Ellipsoid(T @ e.T_world_object, e.radii).vector() for e in (a, b)]
-        difference, difference_turned = a.vector() - b.vector(), turned[0] - turned[1]
-        for part in (slice(0, 3), slice(3, 9)):
-            np.testing.assert_allclose(np.linalg.norm(difference[part]), np.linalg.norm(difference_turned[part]))
-
-
-def tangent(reference: Ellipsoid, ellipsoid: Ellipsoid) -> Array:
-    """(9,) rotation, translation in the body, radii, between ellipsoids with the same order of axes."""
-    R = reference.T_world_object[:3, :3].T @ ellipsoid.T_world_object[:3, :3]
-    R = R * np.sign(np.diag(R))  # an axis and its opposite are one axis
-    t = reference.T_world_object[:3, :3].T @ (ellipsoid.T_world_object[:3, 3] - reference.T_world_object[:3, 3])
-    return np.concatenate([Rotation.from_matrix(R).as_rotvec(), t, ellipsoid.radii - reference.radii])
-
-
-def test_covariance_of_pose_and_radii_against_sampling() -> None:
-    """50,000 samples: entries agree within 4 % of the product of their standard deviations (5 sigma: 2.2 %)."""
-    rng = np.random.default_rng(2)
-    T = gtsam.Pose3(gtsam.Rot3.RzRyRx(0.5, 0.3, -0.7), np.array([1.0, 2.0, 3.0])).matrix()
-    vector = Ellipsoid(T, np.array([0.1, 0.2, 0.45])).vector()
-    A = rng.normal(size=(9, 9))
-    covariance = (A @ A.T + 2.0 * np.eye(9)) * 1e-5
-    reference = Ellipsoid.from_vector(vector)
-    samples = rng.multivariate_normal(vector, covariance, size=50_000)
-    sampled = np.cov(np.stack([tangent(reference, Ellipsoid.from_vector(v)) for v in samples]).T)
-    analytic = covariance_of_pose_and_radii(vector, covariance)
-    sigmas = np.sqrt(np.diag(sampled))
-    np.testing.assert_allclose(analytic / np.outer(sigmas, sigmas), sampled / np.outer(sigmas, sigmas), atol=0.04)
-
-
-def test_covariance_of_pose_and_radii_has_its_inverse() -> None:
-    rng = np.random.default_rng(3)
-    T = gtsam.Pose3(gtsam.Rot3.RzRyRx(0.5, 0.3, -0.7), np.array([1.0, 2.0, 3.0])).matrix()
-    vector = Ellipsoid(T, np.array([0.1, 0.2, 0.45])).vector()
-    A = rng.normal(size=(9, 9))
-    covariance = (A @ A.T + np.eye(9)) * 1e-6
-    ellipsoid = Ellipsoid.from_vector(vector)
-    there = covariance_of_pose_and_radii(vector, covariance)
-    back = covariance_of_vector(ellipsoid.T_world_object, ellipsoid.radii, there)
-    # Rotations are held within their half circle on the way, and a floor of 1e-9 comes on the way back.
-    np.testing.assert_allclose(back, covariance, atol=2e-4 * np.abs(covariance).max() + 1e-9)
-
-
-def test_a_sphere_has_no_known_rotation() -> None:
-    vector = Ellipsoid(np.eye(4), np.full(3, 0.2)).vector()
-    covariance = covariance_of_pose_and_radii(vector, np.eye(9) * 1e-4)
-    assert np.isfinite(covariance).all()
-    np.testing.assert_allclose(np.diag(covariance)[:3], np.pi**2 / 12.0, rtol=1e-6)
-    np.testing.assert_allclose(np.diag(covariance)[6:], 0.2**2 * 1e-4, rtol=1e-9)
-    assert np.linalg.eigvalsh(covariance).min() > -1e-12
-    assert np.linalg.eigvalsh(covariance_of_vector(np.eye(4), np.full(3, 0.2), covariance)).min() > 0.0
-
-
-# -- eigenvectors ---------------------------------------------------------------------------------------------------
-
-entries = st.one_of(st.floats(-5.0, 5.0), st.sampled_from([0.0, 1e-12, -1e-8, 1.0, 1.0 + 1e-13]))
-logarithmic_shapes = st.lists(entries, min_size=6, max_size=6).map(np.array)
-
-
-@settings(max_examples=300, deadline=None, derandomize=True)
-@given(L=logarithmic_shapes)
-def test_eigenvectors_against_lapack(L: Array) -> None:
-    """Equal, nearly equal and vanishing eigenvalues included; they come in no order."""
-    values, V = np.empty(3), np.empty((3, 3))
-    _eigen(np.concatenate([np.zeros(3), L]), values, V)
-    matrix = matrix_from_vector(L)
-    scale = max(float(np.abs(matrix).max()), 1e-300)
-    np.testing.assert_allclose(np.sort(values), np.linalg.eigvalsh(matrix), rtol=0.0, atol=1e-14 * scale * 10)
-    np.testing.assert_allclose(V.T @ V, np.eye(3), atol=1e-14)
-    np.testing.assert_allclose((V * values) @ V.T, matrix, rtol=0.0, atol=1e-13 * scale)
-
-
-@settings(max_examples=100, deadline=None, derandomize=True)
-@given(Ls=st.lists(logarithmic_shapes, min_size=0, max_size=4))
-def test_shapes_are_exponentials(Ls: list[Array]) -> None:
-    """S = exp(2 L), through the eigenvalues of LAPACK."""
-    vectors = np.array([[1.0, 2.0, 3.0, *L] for L in Ls]).reshape(-1, 9)
-    found = shapes(vectors)
-    assert found.shape == (len(Ls), 3, 3)
-    for S, L in zip(found, Ls, strict=True):
-        values, V = np.linalg.eigh(matrix_from_vector(L))
-        expected = (V * np.exp(2.0 * values)) @ V.T
-        np.testing.assert_allclose(S, expected, rtol=0.0, atol=1e-12 * np.abs(expected).max())
-
-
-def test_shapes_by_hand() -> None:
-    """Radii of 1, 2 and 3 along the axes, and a ball."""
-    along = Ellipsoid(np.eye(4), np.array([1.0, 2.0, 3.0])).vector()
-    np.testing.assert_allclose(shapes(np.stack([along, np.zeros(9)])), [np.diag([1.0, 4.0, 9.0]), np.eye(3)])
