@@ -128,8 +128,10 @@ class Estimator:
         """Associate and relinearise until nothing changes any more: the best estimate of all that was seen."""
         if not self.stamps:
             return
-        for _ in range(self.ROUNDS):
+        for left in reversed(range(self.ROUNDS)):
             changed = self._upkeep.revise()
+            if left:  # what is given here is judged in the next round
+                changed += sum(self._objects.give_open(k) for k in range(len(self.stamps)))
             self._new.start_leftovers()
             self._converge(self.ITERATIONS_OF_A_ROUND)
             self._upkeep.merge()

@@ -17,6 +17,7 @@ from calibslam_backend.association.innovation import innovations
 from calibslam_backend.association.localisation import localise
 from calibslam_backend.association.matching import (
     GIVEN,
+    AssociationSettings,
     Prediction,
     Votes,
     assign,
@@ -54,6 +55,7 @@ class DataAssociation:
         self.camera, self.settings, self.counts = camera, settings, counts
         self._assignments = assignments
         self._graph: ObjectGraph = assignments.graph
+        self._anywhere = replace(settings, min_overlap=0.0)  # boxes need not lie where they are expected
         self._noise = NoiseModel(settings)
         self._votes = Votes(settings.votes)
         # (bound quadric, the one that it was found to be) -> tracks of which it was found.
@@ -141,16 +143,59 @@ class DataAssociation:
             for j in self._graph.landmarks
             if j not in taken and self._graph.is_solved(j) and self._in_question(T, j, open_boxes)
         ]
+        covariances = dict(zip(near, self._covariances_after(k - 1, near, step), strict=True))
+        classes = [tracks[frame.tracks[n]].class_id for n in rows]
+        for r, j in self._matched(T, covariances, open_boxes, classes, self.settings):
+            self._vote_for(frame.tracks[rows[r]], j)
+
+    def give_open(self, k: int) -> int:
+        """Open boxes of keyframe k go to the quadrics of their class that explain them, as far off as the pose may be.
+
+        Where odometry has failed, boxes may lie beside the quadrics that they are of, and without them the pose stays
+        where it is. Whoever judges boxes with poses as they are estimated gives them to nobody (see `revision`).
+
+        Returns:
+            How many.
+        """
+        if self.settings.association == GIVEN:
+            return 0
+        books, frame = self._assignments, self._assignments.frames[k]
+        rows = [n for n, j in enumerate(frame.quadrics) if j is None]
+        classes = [frame.classes[n] for n in rows]
+        free = [
+            j
+            for j in self._graph.landmarks
+            if self._graph.is_solved(j) and j not in frame.quadrics and books.class_of_quadric(j) in classes
+        ]
+        if not free:
+            return 0
+        covariances = dict(zip(free, self._graph.joint_covariances(k, free), strict=True))
+        boxes = [frame.boxes[n] for n in rows]
+        found = self._matched(self._graph.pose(k), covariances, boxes, classes, self._anywhere)
+        for r, j in found:
+            books.give(k, rows[r], j)
+            books.rebind(frame.tracks[rows[r]], self.settings.votes)
+        self.counts["given_late"] += len(found)
+        return len(found)
+
+    def _matched(
+        self,
+        T_map_camera: Array,
+        covariances: dict[int, Array],
+        boxes: list[BoxMeasurement],
+        classes: list[str],
+        settings: AssociationSettings,
+    ) -> list[tuple[int, int]]:
+        """Of these boxes, with classes, and the quadrics of these covariances (15, 15) with the pose, those pairs
+        (index of the box, id of the quadric) that leave no doubt."""
         predictions = []
-        for j, covariance in zip(near, self._covariances_after(k - 1, near, step), strict=True):
+        for j, covariance in covariances.items():
             vector = self._graph.quadric(j)
-            prediction = predict(T, vector, covariance, self.camera.K, open_boxes[0], self.settings.model_error)
+            prediction = predict(T_map_camera, vector, covariance, self.camera.K, boxes[0], settings.model_error)
             if prediction is not None:
                 predictions.append(Prediction(j, *prediction, self._assignments.class_of_quadric(j)))
-        classes = [tracks[frame.tracks[n]].class_id for n in rows]
-        cost = distances(predictions, open_boxes, classes, self.settings)
-        for p, r in unambiguous(cost, assign(cost), self.settings.ambiguity):
-            self._vote_for(frame.tracks[rows[r]], predictions[p].landmark)
+        cost = distances(predictions, boxes, classes, settings)
+        return [(r, predictions[p].landmark) for p, r in unambiguous(cost, assign(cost), settings.ambiguity)]
 
     def _in_question(self, T_map_camera: Array, j: int, boxes: list[BoxMeasurement]) -> bool:
         """Whether one of these boxes may be of a quadric: worth the cost of its joint covariance with the pose."""

@@ -120,7 +120,7 @@ def initialise_by_newest(
     found = None
     while found is None and len(boxes) >= settings.min_boxes:
         found = initialise(poses, boxes, K, robust_scale, settings)
-        older = (len(boxes) + 1) // 2
+        older = max(len(boxes) // 2, 1)
         poses, boxes = poses[older:], boxes[older:]
     return found
 

@@ -49,11 +49,12 @@ class World:
         T[:3, 3] = place
         return Ellipsoid(self.graph.pose(0) @ T, np.full(3, radius)).vector()
 
-    def show(self, *seen: tuple[tuple[float, float, float], int]) -> None:
-        """The next keyframe shows cups at these places, of these tracks."""
+    def show(self, *seen: tuple[tuple[float, float, float], int], seen_from: Array | None = None) -> None:
+        """The next keyframe shows cups at these places, of these tracks, from where it is, or from this pose (4, 4)."""
         k = len(self.books.frames)
+        T = self.graph.pose(k) if seen_from is None else seen_from
         corners = [
-            box_of_visible_part(self.graph.pose(k), self.cup(place), CAMERA.K, image_bounds(640, 480), ~ALL_EDGES)[1]
+            box_of_visible_part(T, self.cup(place), CAMERA.K, image_bounds(640, 480), ~ALL_EDGES)[1]
             for place, _ in seen
         ]
         n, tracks = len(seen), [track for _, track in seen]

@@ -1,0 +1,74 @@
+"""Boxes beside the quadrics that they are of, since the camera is not where it is thought to be: cups, by hand."""
+
+from __future__ import annotations
+
+from collections import Counter
+
+import numpy as np
+import pytest
+from small_map import CAMERA, FRAMES, LEFT, RIGHT, World
+
+from calibslam_backend.association.matching import GIVEN, predicted_corners
+from calibslam_backend.graph.measured import Motion
+from calibslam_msgs_py.measurements import Array
+
+OFF = 0.1  # [m] that odometry errs by in the last motion, to the left: 25 px at a cup that is 30 px wide
+
+
+def lost(
+    *seen: tuple[tuple[float, float, float], int], sigma: float = 0.05, name: str = "cup", **settings: str
+) -> World:
+    """A map of two cups, and a keyframe, a motion of deviation `sigma` [rad, m] later, that shows cups at these places.
+
+    Its boxes carry the class `cup`, the cups of the map this one.
+    """
+    world = World(**settings)
+    for j, place in enumerate((LEFT, RIGHT)):
+        world.books.know(j, world.cup(place), np.eye(9) * 1e-6, Counter({name: 1}))
+    for _ in range(FRAMES):
+        world.show()
+    motion = Motion(np.eye(4), np.eye(6) * sigma**2, 0.0, np.eye(4))
+    world.graph.add_pose(motion, world.graph.predict(motion))
+    world.graph.update()
+    world.show(*seen, seen_from=truth(world))
+    return world
+
+
+def truth(world: World) -> Array:
+    """(4, 4) T_map_camera of the last keyframe."""
+    off = np.eye(4)
+    off[0, 3] = OFF
+    return np.asarray(world.graph.pose(FRAMES - 1) @ off)
+
+
+def test_boxes_that_the_pose_explains_are_given_and_put_it_right() -> None:
+    world = lost((LEFT, 0), (RIGHT, 1))
+    assert world.upkeep.revise() == 0  # takes the pose as it is
+    assert world.objects.give_open(FRAMES) == 2
+    assert [world.keyframes(j) for j in (0, 1)] == [[FRAMES]] * 2
+    assert world.books.frames[FRAMES].quadrics == [0, 1]
+    assert world.counts["given_late"] == 2
+    for _ in range(3):
+        world.graph.iterate()
+    for place, box in zip((LEFT, RIGHT), world.books.frames[FRAMES].boxes, strict=True):
+        found = predicted_corners(world.graph.pose(FRAMES), world.cup(place), CAMERA.K, box)
+        np.testing.assert_allclose(found, box.corners, atol=1.0)  # 25 px before
+    assert world.upkeep.revise() == 0 and world.objects.give_open(FRAMES) == 0
+
+
+def test_a_pose_that_is_known_explains_nothing_beside_it() -> None:
+    world = lost((LEFT, 0), (RIGHT, 1), sigma=0.002)
+    assert world.objects.give_open(FRAMES) == 0
+    assert world.books.frames[FRAMES].quadrics == [None, None]
+
+
+def test_what_may_be_of_either_stays_open() -> None:
+    """A box half way between two cups, seen by a camera that may be anywhere."""
+    between = (-OFF, 0.0, 2.0)
+    assert lost(((OFF, 0.0, 2.0), 0), sigma=0.2).objects.give_open(FRAMES) == 0
+    assert lost((between, 0), sigma=0.2).objects.give_open(FRAMES) == 0
+
+
+@pytest.mark.parametrize("settings", [{"name": "bottle"}, {"association": GIVEN}])
+def test_other_classes_and_given_identities_are_left_alone(settings: dict[str, str]) -> None:
+    assert lost((LEFT, 0), (RIGHT, 1), **settings).objects.give_open(FRAMES) == 0
