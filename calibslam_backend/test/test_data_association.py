@@ -62,11 +62,10 @@ def test_a_pose_that_is_known_explains_nothing_beside_it() -> None:
     assert world.books.frames[FRAMES].quadrics == [None, None]
 
 
-def test_what_may_be_of_either_stays_open() -> None:
-    """A box half way between two cups, seen by a camera that may be anywhere."""
-    between = (-OFF, 0.0, 2.0)
-    assert lost(((OFF, 0.0, 2.0), 0), sigma=0.2).objects.give_open(FRAMES) == 0
-    assert lost((between, 0), sigma=0.2).objects.give_open(FRAMES) == 0
+@pytest.mark.parametrize("x", [OFF, -OFF])
+def test_what_may_be_of_either_stays_open(x: float) -> None:
+    """A box half way between where two cups are expected, or 50 px nearer to one, where the pose may be 112 px off."""
+    assert lost(((x, 0.0, 2.0), 0), sigma=0.2).objects.give_open(FRAMES) == 0
 
 
 @pytest.mark.parametrize("settings", [{"name": "bottle"}, {"association": GIVEN}])
