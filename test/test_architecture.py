@@ -57,6 +57,27 @@ def test_imports(file: Path) -> None:
         assert not ros, f"only *_node.py may import {ros}"
 
 
+@pytest.mark.parametrize("package", PACKAGES)
+def test_folders_know_each_other_in_one_direction(package: str) -> None:
+    root = PROJECT / package / package
+    folders = {folder.name for folder in root.iterdir() if (folder / "__init__.py").exists()}
+    known = {
+        folder: {
+            m.split(".")[1]
+            for file in (root / folder).rglob("*.py")
+            for m in imports(file)
+            if m.startswith(f"{package}.")
+        }
+        & folders - {folder}
+        for folder in folders
+    }
+    assert len(folders) > 3
+    left = set(folders)
+    while free := {folder for folder in left if not known[folder] & left}:
+        left -= free
+    assert not left, f"these know each other in a circle: {sorted(left)}"
+
+
 @pytest.mark.parametrize("module", ["measurements", "covariance", "conversions", "bags", "settings"])
 def test_offline_modules_load_no_rclpy(module: str) -> None:
     """Also not on a detour."""
