@@ -5,13 +5,13 @@ from __future__ import annotations
 import gtsam
 import numpy as np
 import pytest
-from gtsam import symbol
 
+from calibslam_backend.graph.keys import q, x
 from calibslam_backend.graph.smoother import Smoother
 from calibslam_msgs_py.measurements import Array
 
-X = [int(symbol("x", k)) for k in range(6)]
-Q = int(symbol("q", 0))
+X = [x(k) for k in range(6)]
+Q = q(0)
 STEP = gtsam.Pose3.Expmap(np.array([0.05, 0.1, -0.05, 0.3, 0.0, 0.1]))
 NAMES = ["origin", "fix", "other", *(("motion", k) for k in range(1, 6))]
 LOOSE, TIGHT = gtsam.noiseModel.Isotropic.Sigma(6, 0.1), gtsam.noiseModel.Isotropic.Sigma(6, 0.01)

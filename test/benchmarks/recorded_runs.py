@@ -11,6 +11,7 @@ import numpy as np
 from benchmark_table import AnyRow, Row
 
 from calibslam_backend.estimator import Estimator, EstimatorSettings
+from calibslam_backend.graph.keys import x
 from calibslam_backend.recording import Recording
 from calibslam_backend.slam_bag import slam_bag
 from calibslam_msgs_py.measurements import InvalidMeasurement
@@ -112,7 +113,7 @@ def solver_rows(folder: Path, scratch: Path) -> list[AnyRow]:
     # The first iteration from the estimate of odometry alone, where there is something to do.
     start = gtsam.Values(values)
     for k, pose in enumerate(estimator.odometry()[0]):
-        start.update(gtsam.symbol("x", k), gtsam.Pose3(pose))
+        start.update(x(k), gtsam.Pose3(pose))
     per_iteration = []
     for _ in range(REPETITIONS):
         optimiser = gtsam.LevenbergMarquardtOptimizer(graph, start, gtsam.LevenbergMarquardtParams())

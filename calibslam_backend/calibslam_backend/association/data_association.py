@@ -86,14 +86,14 @@ class DataAssociation:
         """Normalised innovations squared of the boxes of bound tracks; arguments as in `localise`."""
         known = [(j, box) for j, box in self._assignments.bound(frame) if self._graph.is_solved(j)]
         ids = sorted({j for j, _ in known})
-        joint = dict(zip(ids, self._covariances_after(len(self._assignments.frames) - 1, ids, covariance), strict=True))
+        joint = self._covariances_after(len(self._assignments.frames) - 1, ids, covariance)
         vectors, boxes = [self._graph.quadric(j) for j, _ in known], [box for _, box in known]
         return innovations(predicted, vectors, [joint[j] for j, _ in known], boxes, self.camera.K)
 
-    def _covariances_after(self, k: int, quadrics: list[int], step: Array) -> list[Array]:
+    def _covariances_after(self, k: int, quadrics: list[int], step: Array) -> dict[int, Array]:
         """For each of these quadrics (15, 15) of it and of a pose that is a step (6, 6) after that of keyframe k."""
         joint = self._graph.joint_covariances(k, quadrics)
-        for each in joint:
+        for each in joint.values():
             each[:6, :6] += step
         return joint
 
@@ -143,7 +143,7 @@ class DataAssociation:
             for j in self._graph.landmarks
             if j not in taken and self._graph.is_solved(j) and self._in_question(T, j, open_boxes)
         ]
-        covariances = dict(zip(near, self._covariances_after(k - 1, near, step), strict=True))
+        covariances = self._covariances_after(k - 1, near, step)
         classes = [tracks[frame.tracks[n]].class_id for n in rows]
         for r, j in self._matched(T, covariances, open_boxes, classes, self.settings):
             self._vote_for(frame.tracks[rows[r]], j)
@@ -169,7 +169,7 @@ class DataAssociation:
         ]
         if not free:
             return 0
-        covariances = dict(zip(free, self._graph.joint_covariances(k, free), strict=True))
+        covariances = self._graph.joint_covariances(k, free)
         boxes = [frame.boxes[n] for n in rows]
         found = self._matched(self._graph.pose(k), covariances, boxes, classes, self._anywhere)
         for r, j in found:

@@ -166,14 +166,14 @@ class ObjectGraph:
         }
         return {j: self.correlation.understated * covariance for j, covariance in own.items()}
 
-    def joint_covariances(self, k: int, quadrics: list[int]) -> list[Array]:
+    def joint_covariances(self, k: int, quadrics: list[int]) -> dict[int, Array]:
         """For each of these quadrics (15, 15) of pose k and the quadric: columns of `box_of_visible_part`; the
         tree's own, for gates."""
         if not quadrics:
-            return []
+            return {}
         joint = self._smoother.joint([x(k), *map(q, quadrics)])
-        pairs = [(x(k), q(j)) for j in quadrics]
-        return [np.block([[joint.at(a, b) for b in pair] for a in pair]) for pair in pairs]
+        pairs = {j: (x(k), q(j)) for j in quadrics}
+        return {j: np.block([[joint.at(a, b) for b in pair] for a in pair]) for j, pair in pairs.items()}
 
     # -- changes, which take effect with the next update --------------------------------------------------------
 

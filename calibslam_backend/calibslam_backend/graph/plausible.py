@@ -15,8 +15,6 @@ LARGEST_STEP = 0.5  # [rad, m] of a pose in one update; an undamped step that is
 
 def is_object(vectors: Array, camera: Array) -> NDArray[np.bool_]:
     """(M,) whether quadrics (M, 9) have the size of objects, and a place not too far from the camera (3,) [m]."""
-    if not len(vectors):
-        return np.zeros(0, bool)
     finite: NDArray[np.bool_] = np.all(np.isfinite(vectors), axis=1)
     known = np.where(finite[:, None], vectors, 0.0)
     radii = np.exp(np.linalg.eigvalsh(matrix_from_vector(known[:, 3:])))
