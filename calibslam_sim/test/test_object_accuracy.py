@@ -9,8 +9,12 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from calibslam_backend.geometry.ellipsoid import Ellipsoid
-from calibslam_sim.accuracy.objects import MAX_CENTRE_DISTANCE, iou, matches, object_accuracy
+from calibslam_sim.accuracy.objects import MAX_CENTRE_DISTANCE, MapObject, iou, matches, object_accuracy
 from calibslam_sim.simulation.sampling import unit_cube
+
+
+def thing(centre: list[float], radii: list[float], class_id: str = "cup") -> MapObject:
+    return MapObject(class_id, ellipsoid(centre, radii))
 
 
 def ellipsoid(centre: list[float], radii: list[float], rotation: list[float] | None = None) -> Ellipsoid:
@@ -51,24 +55,37 @@ def test_an_ellipsoid_is_itself_however_it_is_written(radii: list[float], rotati
     T[:3, :3] = T[:3, :3][:, [1, 2, 0]]
     b = Ellipsoid(T, a.radii[[1, 2, 0]])
     assert iou(a, b) == pytest.approx(1.0)
-    accuracy = object_accuracy([a], [b])
+    accuracy = object_accuracy([MapObject("cup", a)], [MapObject("cup", b)])
     assert accuracy.matched == 1
     assert accuracy.centre_m == pytest.approx(0.0)
     assert accuracy.radii == pytest.approx(0.0)
 
 
 def test_far_estimates_are_nobodys() -> None:
-    true = [ellipsoid([0, 0, 0], [0.1] * 3), ellipsoid([1, 0, 0], [0.1] * 3)]
-    estimated = [ellipsoid([9, 0, 0], [0.1] * 3), ellipsoid([1.1, 0, 0], [0.11, 0.1, 0.1])]
+    true = [thing([0, 0, 0], [0.1] * 3), thing([1, 0, 0], [0.1] * 3)]
+    estimated = [thing([9, 0, 0], [0.1] * 3), thing([1.1, 0, 0], [0.11, 0.1, 0.1])]
     assert matches(estimated, true) == [(1, 1)]
     accuracy = object_accuracy(estimated, true)
     assert (accuracy.true, accuracy.estimated, accuracy.matched) == (2, 2, 1)
     assert accuracy.centre_m == pytest.approx(0.1)
     assert accuracy.radii == pytest.approx(0.1 / 3.0)
-    assert matches([ellipsoid([MAX_CENTRE_DISTANCE + 0.01, 0, 0], [0.1] * 3)], true[:1]) == []
+    assert matches([thing([MAX_CENTRE_DISTANCE + 0.01, 0, 0], [0.1] * 3)], true[:1]) == []
+
+
+def test_an_estimate_is_of_an_object_of_its_class() -> None:
+    # A bear, and the bottle that a detector sees in its belly: the bottle is nearer to the bear's true centre.
+    true = [thing([0, 0, 0], [0.1] * 3, "teddy bear"), thing([0.4, 0, 0], [0.1] * 3, "bottle")]
+    bear, belly = thing([0.05, 0, 0], [0.1] * 3, "teddy bear"), thing([0.01, 0, 0], [0.02] * 3, "bottle")
+    assert matches([belly, bear], true[:1]) == [(1, 0)]
+    accuracy = object_accuracy([belly, bear], true[:1])
+    assert (accuracy.true, accuracy.estimated, accuracy.matched) == (1, 2, 1)
+    assert accuracy.centre_m == pytest.approx(0.05)
+    # Where there is a bottle within reach it is taken for that one, far as it is.
+    assert matches([belly, bear], true) == [(0, 1), (1, 0)]
+    assert matches([belly], [true[0]]) == []
 
 
 def test_an_empty_map_matches_nothing() -> None:
-    accuracy = object_accuracy([], [ellipsoid([0, 0, 0], [0.1] * 3)])
+    accuracy = object_accuracy([], [thing([0, 0, 0], [0.1] * 3)])
     assert (accuracy.true, accuracy.estimated, accuracy.matched) == (1, 0, 0)
     assert np.isnan(accuracy.iou)

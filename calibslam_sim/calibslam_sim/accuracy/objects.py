@@ -17,13 +17,22 @@ IOU_POINTS = 20_000
 
 
 @dataclass(frozen=True)
+class MapObject:
+    """What is compared: an object's class and its ellipsoid, in a frame that both sides share."""
+
+    class_id: str
+    ellipsoid: Ellipsoid
+
+
+@dataclass(frozen=True)
 class ObjectAccuracy:
     """Agreement of a map with the truth.
 
     Attributes:
         true: number of objects there are.
         estimated: number of objects in the map.
-        matched: number of pairs, each the nearest that is left, at most `MAX_CENTRE_DISTANCE` apart.
+        matched: number of pairs of one class, each at most `MAX_CENTRE_DISTANCE` apart; what is left of the true ones
+            is missed, what is left of the estimated ones is of no object.
         centre_m: mean distance of the centres of pairs [m]; NaN without any pair, as those below.
         radii: mean error of the semi-axes of pairs, compared by size, as a share of the true ones.
         iou: mean intersection over union of the volumes of pairs.
@@ -37,25 +46,30 @@ class ObjectAccuracy:
     iou: float
 
 
-def object_accuracy(estimated: Sequence[Ellipsoid], true: Sequence[Ellipsoid]) -> ObjectAccuracy:
+def object_accuracy(estimated: Sequence[MapObject], true: Sequence[MapObject]) -> ObjectAccuracy:
     """Compare a map, already aligned with the world, to the objects of the world."""
-    pairs = matches(estimated, true)
-    centres = [float(np.linalg.norm(_centre(estimated[i]) - _centre(true[j]))) for i, j in pairs]
-    radii = [float(np.mean(np.abs(np.sort(estimated[i].radii) / np.sort(true[j].radii) - 1.0))) for i, j in pairs]
-    overlaps = [iou(estimated[i], true[j]) for i, j in pairs]
+    pairs = [(estimated[i].ellipsoid, true[j].ellipsoid) for i, j in matches(estimated, true)]
+    centres = [float(np.linalg.norm(_centre(a) - _centre(b))) for a, b in pairs]
+    radii = [float(np.mean(np.abs(np.sort(a.radii) / np.sort(b.radii) - 1.0))) for a, b in pairs]
+    overlaps = [iou(a, b) for a, b in pairs]
     return ObjectAccuracy(len(true), len(estimated), len(pairs), _mean(centres), _mean(radii), _mean(overlaps))
 
 
-def matches(estimated: Sequence[Ellipsoid], true: Sequence[Ellipsoid]) -> list[tuple[int, int]]:
-    """Pairs (estimated, true) of least total distance of centres, none above `MAX_CENTRE_DISTANCE`."""
+def matches(estimated: Sequence[MapObject], true: Sequence[MapObject]) -> list[tuple[int, int]]:
+    """Pairs (estimated, true) of least total distance of centres, of one class, none above `MAX_CENTRE_DISTANCE`.
+
+    Of one class: a detector that takes a part of an object for another one puts both into the map, at one place.
+    """
     if not estimated or not true:
         return []
-    a = np.array([_centre(e) for e in estimated])
-    b = np.array([_centre(e) for e in true])
+    a = np.array([_centre(thing.ellipsoid) for thing in estimated])
+    b = np.array([_centre(thing.ellipsoid) for thing in true])
     distances = np.linalg.norm(a[:, None] - b[None, :], axis=2)
+    unlike = np.array([[x.class_id != y.class_id for y in true] for x in estimated])
     # Cut off, so that one far estimate does not push others away from their objects.
-    rows, columns = linear_sum_assignment(np.minimum(distances, MAX_CENTRE_DISTANCE))
-    return [(int(i), int(j)) for i, j in zip(rows, columns, strict=True) if distances[i, j] < MAX_CENTRE_DISTANCE]
+    costs = np.where(unlike, MAX_CENTRE_DISTANCE, np.minimum(distances, MAX_CENTRE_DISTANCE))
+    rows, columns = linear_sum_assignment(costs)
+    return [(int(i), int(j)) for i, j in zip(rows, columns, strict=True) if costs[i, j] < MAX_CENTRE_DISTANCE]
 
 
 def iou(a: Ellipsoid, b: Ellipsoid) -> float:

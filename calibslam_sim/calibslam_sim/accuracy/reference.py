@@ -12,6 +12,7 @@ from calibslam_msgs_py.bags import BagError, BagReader
 from calibslam_msgs_py.conversions import odometry_from_msg, quadrics_from_msg, stamped_pose_from_msg
 from calibslam_msgs_py.measurements import InvalidMeasurement, RelativeMotion, StampedPose
 from calibslam_sim import topics
+from calibslam_sim.accuracy.objects import MapObject
 from calibslam_sim.tum_folder import TumError, read_trajectory
 
 
@@ -31,7 +32,7 @@ class Reference:
 
     truth: Trajectory
     motions: list[RelativeMotion]
-    objects: list[Ellipsoid] | None
+    objects: list[MapObject] | None
 
 
 def read_reference(path: Path) -> Reference:
@@ -64,7 +65,7 @@ def _from_tum(path: Path) -> Reference:
 def _from_bag(path: Path) -> Reference:
     poses: dict[int, StampedPose] = {}
     motions: list[RelativeMotion] = []
-    objects: list[Ellipsoid] | None = None
+    objects: list[MapObject] | None = None
     differencer = OdometryDifferencer()
     with BagReader(path) as bag:
         wanted = {topics.GROUND_TRUTH, topics.ODOMETRY, topics.GROUND_TRUTH_QUADRICS} & set(bag.topics)
@@ -82,7 +83,7 @@ def _from_bag(path: Path) -> Reference:
                         motions.append(motion)
                 else:
                     quadrics = quadrics_from_msg(message)
-                    objects = [Ellipsoid(quadric.T_map_object, quadric.radii) for quadric in quadrics]
+                    objects = [MapObject(q.class_id, Ellipsoid(q.T_map_object, q.radii)) for q in quadrics]
             except InvalidMeasurement:
                 continue  # the back end has counted and reported it
     if len(poses) < 2:

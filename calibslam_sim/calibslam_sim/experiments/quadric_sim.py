@@ -22,7 +22,7 @@ from calibslam_backend.graph.noise import FIXED, QUADRICSLAM
 from calibslam_backend.output.metrics import Trajectory, alignment
 from calibslam_backend.output.object_map import ObjectMap
 from calibslam_msgs_py.settings import setting
-from calibslam_sim.accuracy.objects import object_accuracy
+from calibslam_sim.accuracy.objects import MapObject, object_accuracy
 from calibslam_sim.experiments.design import (
     CALIBRATED,
     OVERCONFIDENT,
@@ -87,14 +87,15 @@ def accuracy(result: ObjectMap, recording: Simulation) -> Metrics:
     truth = Trajectory(recording.times, recording.T_world_camera)
     T_world_map = alignment(Trajectory(np.array(result.stamps), result.poses), truth)
     objects = object_accuracy(
-        [Ellipsoid(T_world_map @ quadric.T_map_object, quadric.radii) for quadric in result.quadrics],
-        [thing.ellipsoid for thing in recording.world],
+        [MapObject(q.class_id, Ellipsoid(T_world_map @ q.T_map_object, q.radii)) for q in result.quadrics],
+        [MapObject(thing.class_id, thing.ellipsoid) for thing in recording.world],
     )
     return {
         **accuracy_of_trajectory(result, truth),
         "centre_m": objects.centre_m,
         "iou_error": 1.0 - objects.iou,
         "missed": float(objects.true - objects.matched),
+        "spurious": float(objects.estimated - objects.matched),
     }
 
 
@@ -119,6 +120,7 @@ METRICS = {
     "centre_m": Metric("centres of objects", "m"),
     "iou_error": Metric("1 - IoU in 3-D"),
     "missed": Metric("missed objects"),
+    "spurious": Metric("objects that are none"),
     "nees_position": Metric("NEES (3 is honest)", is_error=False),
 }
 
