@@ -71,7 +71,7 @@ def test_what_is_wrong_with_the_weights_is_said(tmp_path: Path, capsys: pytest.C
 
 
 def test_the_shipped_detector_needs_no_option() -> None:
-    assert image.conditions(image.ImageSettings()) == ["calibrated", "fixed", "quadricslam"]
+    assert image.conditions(image.ImageSettings()) == list(image.NOISE)
 
 
 def test_without_a_second_detector_there_is_no_condition_for_it(files: dict[str, Path]) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import pickle
 from pathlib import Path
 from typing import Any
@@ -24,6 +25,9 @@ COCO = {
 KEYS = {"format", "version", "architecture", "class_names", "frozen_norm", "boxes", "weights"}
 # The detector that comes with this package; MODEL_CARD.md beside it says what it can do.
 SHIPPED = Path(__file__).parents[1] / "default_weights" / "compact.pt"
+# Another covariance head for it, trained by the likelihood alone, to compare with.
+SHIPPED_NLL_HEAD = SHIPPED.with_name("compact_nll_head.pt")
+HEAD_FORMAT, HEAD_VERSION = "calibslam_covariance_head", 1
 
 
 class WeightsError(ValueError):
@@ -45,6 +49,24 @@ def save(model: CalibratedDetector, path: Path, half: bool = False) -> None:
     write_safely(content, path)
 
 
+def save_head(model: CalibratedDetector, path: Path) -> None:
+    """Write the covariance head alone, at half precision: the shipped detector, with this head, in a small file.
+
+    Raises:
+        ValueError: the model is not the shipped detector with another head.
+    """
+    shipped = load(SHIPPED).detector.state_dict()
+    if any(not torch.equal(weight.cpu(), shipped[name]) for name, weight in model.detector.state_dict().items()):
+        raise ValueError("only heads of the shipped detector are written alone; use save()")
+    content = {
+        "format": HEAD_FORMAT,
+        "version": HEAD_VERSION,
+        "detector": _checksum(SHIPPED),
+        "weights": {name: _halved(weight) for name, weight in model.covariance_head.state_dict().items()},
+    }
+    write_safely(content, path)
+
+
 def write_safely(content: dict[str, Any], path: Path) -> None:
     """Write with torch, so that the file is whole or as it was."""
     part = path.with_name(f".{path.name}.part")
@@ -53,12 +75,14 @@ def write_safely(content: dict[str, Any], path: Path) -> None:
 
 
 def load(path: Path = SHIPPED) -> CalibratedDetector:
-    """The detector of a file, on the CPU, ready to detect.
+    """The detector of a file, on the CPU, ready to detect; of a head alone, the shipped detector with that head.
 
     Raises:
         WeightsError: no such file, not one of ours, damaged, or of another architecture than it says.
     """
     content = read(path, "weights file")
+    if isinstance(content, dict) and content.get("format") == HEAD_FORMAT:
+        return _shipped_with_head(content, path)
     if not isinstance(content, dict) or content.get("format") != FORMAT:
         raise WeightsError(
             f"{path} is not a detector of CalibSLAM; weights of torchvision go to `train --coco-weights`"
@@ -75,6 +99,14 @@ def load(path: Path = SHIPPED) -> CalibratedDetector:
     )
     _fill(model, content["weights"], path, architecture)
     return model.eval()
+
+
+def _shipped_with_head(content: dict[str, Any], path: Path) -> CalibratedDetector:
+    if content.get("version") != HEAD_VERSION or content.get("detector") != _checksum(SHIPPED):
+        raise WeightsError(f"{path} is a covariance head of another release's detector; train it again")
+    model = load(SHIPPED)
+    _fill(model.covariance_head, content.get("weights"), path, "the covariance head of the shipped detector")
+    return model
 
 
 def load_coco(path: Path, architecture: str) -> CalibratedDetector:
@@ -125,6 +157,10 @@ def _fill(module: torch.nn.Module, weights: Any, path: Path, architecture: str) 
         raise WeightsError(f"{path} does not fit {architecture}: {reason[:200]}") from None
     if bad := [name for name, w in module.state_dict().items() if not torch.isfinite(w).all()]:
         raise WeightsError(f"{path} holds NaN or infinity in {bad[0]}: its training has failed")
+
+
+def _checksum(path: Path) -> str:
+    return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
 def _halved(weight: Tensor) -> Tensor:

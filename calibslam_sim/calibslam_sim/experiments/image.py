@@ -20,7 +20,7 @@ from calibslam_backend.estimator import EstimatorSettings
 from calibslam_backend.graph.noise import CALIBRATED as OWN_COVARIANCE
 from calibslam_backend.graph.noise import FIXED, QUADRICSLAM
 from calibslam_detector.images.image_conversion import decode_compressed
-from calibslam_detector.model.weights_file import SHIPPED
+from calibslam_detector.model.weights_file import SHIPPED, SHIPPED_NLL_HEAD
 from calibslam_msgs_py.conversions import valid_boxes
 from calibslam_msgs_py.measurements import Boxes
 from calibslam_msgs_py.settings import setting
@@ -54,7 +54,9 @@ class ImageSettings(ExperimentSettings):
     """The recordings, and the detectors."""
 
     weights: str = setting("", "file of the detector with covariances trained by f-Cal; empty: the shipped one")
-    nll_weights: str = setting("", "file of the same detector with covariances trained by NLL; empty: left out")
+    nll_weights: str = setting(
+        "", "file of the same detector with covariances trained by NLL; empty: the shipped one's, or left out"
+    )
     duration: float = setting(20.0, "length of a recording", unit="s", low=1.0)
     frame_rate: float = setting(30.0, "odometry steps per second", unit="Hz", low=1.0)
     image_every: int = setting(5, "of so many odometry steps one has an image", low=1)
@@ -103,8 +105,15 @@ def heads(weights: str, nll_weights: str) -> CovarianceHeads:
     Raises:
         ExperimentError: they cannot be used.
     """
-    files = {CALIBRATED: Path(weights) if weights else SHIPPED} | ({NLL: Path(nll_weights)} if nll_weights else {})
-    return CovarianceHeads(files)
+    return CovarianceHeads(files(weights, nll_weights))
+
+
+def files(weights: str, nll_weights: str) -> dict[str, Path]:
+    """Covariance head -> its file. The shipped detector has one of each kind."""
+    found = {CALIBRATED: Path(weights) if weights else SHIPPED}
+    if nll_weights or not weights:
+        found[NLL] = Path(nll_weights) if nll_weights else SHIPPED_NLL_HEAD
+    return found
 
 
 def conditions(settings: ImageSettings) -> list[str]:
@@ -114,7 +123,7 @@ def conditions(settings: ImageSettings) -> list[str]:
         ExperimentError: the detectors cannot be used.
     """
     heads(settings.weights, settings.nll_weights)  # before any process is started
-    return [name for name in NOISE if name != NLL or settings.nll_weights]
+    return [name for name in NOISE if name != NLL or NLL in files(settings.weights, settings.nll_weights)]
 
 
 def comparisons(settings: ImageSettings) -> list[tuple[str, str]]:
