@@ -9,21 +9,27 @@ import pytest
 from small_map import CAMERA, FRAMES, LEFT, RIGHT, World
 
 from calibslam_backend.association.matching import GIVEN, predicted_corners
+from calibslam_backend.geometry.box_measurement import cut_alike
 from calibslam_backend.graph.measured import Motion
 from calibslam_msgs_py.measurements import Array
 
+AT_BORDER = (-0.63, 0.0, 2.0)  # its left half is outside the image of the last keyframe
 OFF = 0.1  # [m] that odometry errs by in the last motion, to the left: 25 px at a cup that is 30 px wide
 
 
 def lost(
-    *seen: tuple[tuple[float, float, float], int], sigma: float = 0.05, name: str = "cup", **settings: str
+    *seen: tuple[tuple[float, float, float], int],
+    sigma: float = 0.05,
+    name: str = "cup",
+    known: tuple[tuple[float, float, float], ...] = (LEFT, RIGHT),
+    **settings: str,
 ) -> World:
-    """A map of two cups, and a keyframe, a motion of deviation `sigma` [rad, m] later, that shows cups at these places.
+    """A map of cups that are known, and a keyframe, a motion of deviation `sigma` [rad, m] later, that shows cups.
 
     Its boxes carry the class `cup`, the cups of the map this one.
     """
     world = World(**settings)
-    for j, place in enumerate((LEFT, RIGHT)):
+    for j, place in enumerate(known):
         world.books.know(j, world.cup(place), np.eye(9) * 1e-6, Counter({name: 1}))
     for _ in range(FRAMES):
         world.show()
@@ -54,6 +60,18 @@ def test_boxes_that_the_pose_explains_are_given_and_put_it_right() -> None:
         found = predicted_corners(world.graph.pose(FRAMES), world.cup(place), CAMERA.K, box)
         np.testing.assert_allclose(found, box.corners, atol=1.0)  # 25 px before
     assert world.upkeep.revise() == 0 and world.objects.give_open(FRAMES) == 0
+
+
+def test_boxes_that_are_cut_differently_are_each_predicted_as_they_are_cut() -> None:
+    """A whole cup and one of which the border cuts off a half, in either order."""
+    places = (RIGHT, AT_BORDER)
+    for order in ((0, 1), (1, 0)):
+        world = lost(*((places[j], track) for track, j in enumerate(order)), known=places)
+        boxes = world.books.frames[FRAMES].boxes
+        assert [bool(box.clip[0]) for box in boxes] == [places[j] == AT_BORDER for j in order]
+        assert cut_alike(boxes) == [[0], [1]] and cut_alike([boxes[0]] * 2) == [[0, 1]]
+        assert world.objects.give_open(FRAMES) == 2
+        assert world.books.frames[FRAMES].quadrics == list(order)
 
 
 def test_a_pose_that_is_known_explains_nothing_beside_it() -> None:

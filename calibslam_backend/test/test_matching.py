@@ -80,7 +80,7 @@ def test_the_gate_lets_its_share_of_right_boxes_pass(gate: float) -> None:
     rng = np.random.default_rng(1)
     corners, predicted = np.array([200.0, 150.0, 330.0, 260.0]), np.diag([3.0, 2.0, 4.0, 1.0]) ** 2
     errors = rng.multivariate_normal(np.zeros(4), predicted + COVARIANCE, size=4000)
-    prediction = Prediction(0, corners, predicted, "cup")
+    prediction = Prediction(corners, predicted, "cup")
     boxes = [box(corners + e) for e in errors]
     cost = distances([prediction], boxes, ["cup"] * 4000, AssociationSettings(gate=gate))
     share = np.isfinite(cost).mean()
@@ -95,13 +95,14 @@ def test_the_gate_lets_its_share_of_right_boxes_pass(gate: float) -> None:
 
 def test_a_wrong_class_costs_its_odds_and_little_overlap_is_no_match() -> None:
     corners = np.array([200.0, 150.0, 330.0, 260.0])
-    prediction = Prediction(0, corners, np.eye(4) * 1e4, "cup")
+    prediction = Prediction(corners, np.eye(4) * 1e4, "cup")
     settings = AssociationSettings(wrong_class=0.05, min_overlap=0.3)
     boxes = [box(corners), box(corners), box(corners + np.array([80.0, 0, 80, 0]))]  # overlap 50 / 210
     cost = distances([prediction], boxes, ["cup", "book", "cup"], settings)[0]
     assert cost[1] - cost[0] == pytest.approx(-np.log(0.05))
     assert np.isinf(cost[2])
     assert distances([], boxes, ["cup"] * 3, settings).shape == (0, 3)
+    assert np.isinf(distances([None], boxes, ["cup"] * 3, settings)).all()
 
 
 def test_cost_of_a_class_by_hand() -> None:
@@ -118,8 +119,8 @@ def test_cost_of_a_class_by_hand() -> None:
 def test_the_surer_landmark_is_not_always_the_nearer_one() -> None:
     """A vague prediction pays for its vagueness: log det."""
     corners = np.array([200.0, 150.0, 330.0, 260.0])
-    sure = Prediction(0, corners + 1.0, np.eye(4), "cup")
-    vague = Prediction(1, corners, np.eye(4) * 400.0, "cup")
+    sure = Prediction(corners + 1.0, np.eye(4), "cup")
+    vague = Prediction(corners, np.eye(4) * 400.0, "cup")
     cost = distances([sure, vague], [box(corners)], ["cup"], AssociationSettings())
     assert cost[0, 0] < cost[1, 0]
 
@@ -131,7 +132,7 @@ def test_what_is_too_vague_may_as_well_be_new() -> None:
     corners, settings = np.array([200.0, 150.0, 330.0, 260.0]), AssociationSettings(wrong_class=0.05)
     for factor, expected in ((0.99, True), (1.01, False)):
         variance = np.exp(factor * new / 2.0)  # the cost of a box right there is log(variance^4) / 2
-        prediction = Prediction(0, corners, np.eye(4) * variance - COVARIANCE, "cup")
+        prediction = Prediction(corners, np.eye(4) * variance - COVARIANCE, "cup")
         assert np.isfinite(distances([prediction], [box(corners)], ["cup"], settings)[0, 0]) == expected
 
 

@@ -29,7 +29,7 @@ from calibslam_backend.association.matching import (
 from calibslam_backend.association.relocalisation import Relocalised, relocalise
 from calibslam_backend.association.tracking import overlap
 from calibslam_backend.estimator_settings import EstimatorSettings
-from calibslam_backend.geometry.box_measurement import BoxMeasurement, prepare
+from calibslam_backend.geometry.box_measurement import BoxMeasurement, cut_alike, prepare
 from calibslam_backend.graph.noise import NoiseModel, spread
 from calibslam_backend.graph.object_graph import ObjectGraph, UpdateReport
 from calibslam_msgs_py.measurements import Array, Boxes, Camera
@@ -188,20 +188,29 @@ class DataAssociation:
     ) -> list[tuple[int, int]]:
         """Of these boxes, with classes, and the quadrics of these covariances (15, 15) with the pose, those pairs
         (index of the box, id of the quadric) that leave no doubt."""
-        predictions = []
-        for j, covariance in covariances.items():
-            vector = self._graph.quadric(j)
-            prediction = predict(T_map_camera, vector, covariance, self.camera.K, boxes[0], settings.model_error)
-            if prediction is not None:
-                predictions.append(Prediction(j, *prediction, self._assignments.class_of_quadric(j)))
-        cost = distances(predictions, boxes, classes, settings)
-        return [(r, predictions[p].landmark) for p, r in unambiguous(cost, assign(cost), settings.ambiguity)]
+        ids = list(covariances)
+        cost = np.full((len(ids), len(boxes)), np.inf)
+        for columns in cut_alike(boxes):
+            some, of_class = [boxes[n] for n in columns], [classes[n] for n in columns]
+            predictions = [self._prediction(T_map_camera, j, covariances[j], some[0], settings) for j in ids]
+            cost[:, columns] = distances(predictions, some, of_class, settings)
+        return [(r, ids[m]) for m, r in unambiguous(cost, assign(cost), settings.ambiguity)]
+
+    def _prediction(
+        self, T_map_camera: Array, j: int, covariance: Array, box: BoxMeasurement, settings: AssociationSettings
+    ) -> Prediction | None:
+        """What quadric j, of this covariance (15, 15) with the pose, predicts for a box cut as this one."""
+        found = predict(T_map_camera, self._graph.quadric(j), covariance, self.camera.K, box, settings.model_error)
+        return found and Prediction(*found, self._assignments.class_of_quadric(j))
 
     def _in_question(self, T_map_camera: Array, j: int, boxes: list[BoxMeasurement]) -> bool:
         """Whether one of these boxes may be of a quadric: worth the cost of its joint covariance with the pose."""
-        predicted = predicted_corners(T_map_camera, self._graph.quadric(j), self.camera.K, boxes[0])
-        measured = np.stack([box.corners for box in boxes])
-        return predicted is not None and bool(overlap(predicted[None], measured).max() >= self.settings.min_overlap)
+        for columns in cut_alike(boxes):
+            predicted = predicted_corners(T_map_camera, self._graph.quadric(j), self.camera.K, boxes[columns[0]])
+            measured = np.stack([boxes[n].corners for n in columns])
+            if predicted is not None and overlap(predicted[None], measured).max() >= self.settings.min_overlap:
+                return True
+        return False
 
     def _vote_for(self, track: int, landmark: int) -> None:
         decided = self._votes.add(track, landmark)

@@ -62,9 +62,8 @@ def gate_of(probability: float) -> float:
 
 @dataclass(frozen=True)
 class Prediction:
-    """The box (4,) [px] that a landmark predicts and its covariance (4, 4) without that of the measurement."""
+    """The box (4,) [px] that a landmark of this class predicts, and its covariance (4, 4) without the measurement's."""
 
-    landmark: int
     corners: Array
     covariance: Array
     class_id: str
@@ -127,9 +126,12 @@ def class_costs(classes: Sequence[Counter[str]], class_id: str, wrong_class: flo
 
 
 def distances(
-    predictions: list[Prediction], boxes: list[BoxMeasurement], classes: list[str], settings: AssociationSettings
+    predictions: Sequence[Prediction | None],
+    boxes: Sequence[BoxMeasurement],
+    classes: Sequence[str],
+    settings: AssociationSettings,
 ) -> Array:
-    """Negative log-likelihood (landmarks, boxes) of a pair; infinite outside the gate.
+    """Negative log-likelihood (landmarks, boxes) of a pair; infinite outside the gate, or of what predicts no box.
 
     Also where a box of some new object is likelier: a prediction that is vague enough lets anything through the gate.
     """
@@ -138,7 +140,7 @@ def distances(
     for b, box in enumerate(boxes):
         limit = new_object_cost(box.bounds, settings.wrong_class)
         for p, prediction in enumerate(predictions):
-            if overlap(prediction.corners[None], box.corners[None])[0, 0] < settings.min_overlap:
+            if prediction is None or overlap(prediction.corners[None], box.corners[None])[0, 0] < settings.min_overlap:
                 continue
             S = prediction.covariance + box.covariance
             difference = box.corners - prediction.corners

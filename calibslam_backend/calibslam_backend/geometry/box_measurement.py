@@ -52,6 +52,14 @@ def stacked(boxes: Sequence[BoxMeasurement]) -> list[NDArray[Any]]:
     return [np.stack([getattr(box, name) for box in boxes]) for name in ("corners", "whitener", "bounds", "clip")]
 
 
+def cut_alike(boxes: Sequence[BoxMeasurement]) -> list[list[int]]:
+    """The indices of boxes of one image, those together whose edges are cut alike: one prediction does for them all."""
+    groups: dict[bytes, list[int]] = {}
+    for n, box in enumerate(boxes):
+        groups.setdefault(box.clip.tobytes(), []).append(n)
+    return list(groups.values())
+
+
 def undistorted(corners: Array, camera: Camera) -> Array:
     """(N, 4) boxes in the distorted image -> (N, 4) in the pinhole image [px].
 
