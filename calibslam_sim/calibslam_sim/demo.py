@@ -30,6 +30,9 @@ from calibslam_sim.processes import POLL, ProcessFailed, ProcessGroup
 from calibslam_sim.progress import Progress
 from calibslam_sim.simulation.recording import SCENARIOS, SimulationSettings
 
+# The most typical of 0 to 29: ATE and RPE with boxes' own covariances over those with 5 px, and NEES, are nearest to
+# their medians (0.89, 0.81 and 2.9). In nine of the thirty ATE is more than with 5 px, RPE in none.
+SEED = 2
 START_TIMEOUT = 180.0  # [s] for all nodes to be there
 SAVE_TIMEOUT = 120.0  # [s]
 REFINEMENT = 1.5  # [s] without measurements until back ends have refined their maps
@@ -156,7 +159,8 @@ def table(results: dict[str, dict[str, Any]]) -> str:
         "",
         "ATE: how far the trajectory is from the true one. RPE: the same from one keyframe to the next.",
         "NEES: squared position error over stated variance; 3 is honest, more is overconfident.",
-        "One recording hardly tells noise models apart (another: --seed 1); docs/results.md has thirty and more.",
+        f"One recording hardly tells noise models apart. Seed {SEED}, the default, is typical of thirty, in nine of",
+        "which 5 px have less ATE; docs/results.md has more.",
     ]
     return "\n".join(lines)
 
@@ -171,7 +175,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         "--out", type=Path, default=Path("calibslam_demo"), help="folder to write (default: ./calibslam_demo)"
     )
     parser.add_argument("--scenario", choices=sorted(SCENARIOS), default="desk", help="(default: desk)")
-    parser.add_argument("--seed", type=int, default=0, help="(default: 0)")
+    parser.add_argument("--seed", type=int, default=SEED, help=f"(default: {SEED}, typical of 0 to 29)")
     parser.add_argument("--duration", type=float, default=60.0, metavar="S", help="(default: 60)")
     parser.add_argument("--rate", type=float, default=4.0, help="times real time (default: 4)")
     arguments = parser.parse_args(argv)
