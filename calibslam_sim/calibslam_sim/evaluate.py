@@ -16,7 +16,6 @@ from typing import Any
 
 import numpy as np
 
-from calibslam_backend.geometry.ellipsoid import Ellipsoid
 from calibslam_backend.odometry.motion_chain import MotionChain, dead_reckoning
 from calibslam_backend.odometry.motion_noise import MotionNoise
 from calibslam_backend.output.metrics import NoGroundTruth, Trajectory, alignment
@@ -25,7 +24,7 @@ from calibslam_backend.output.plots import plot_run
 from calibslam_backend.output.run_folder import accuracy
 from calibslam_msgs_py.command import command
 from calibslam_msgs_py.measurements import Array, RelativeMotion
-from calibslam_sim.accuracy.objects import MapObject, object_accuracy
+from calibslam_sim.accuracy.objects import map_objects, object_accuracy
 from calibslam_sim.accuracy.reference import NoReference, Reference, read_reference
 
 
@@ -45,7 +44,7 @@ def evaluate(folder: Path, reference: Reference) -> dict[str, Any]:
     if odometry is not None:
         found |= accuracy(result.stamps, *odometry, truth, "odometry_")
     if reference.objects is not None:
-        estimated = [MapObject(q.class_id, Ellipsoid(T_world_map @ q.T_map_object, q.radii)) for q in result.quadrics]
+        estimated = map_objects(result.quadrics, T_world_map)
         found["object_accuracy"] = asdict(object_accuracy(estimated, reference.objects))
     (folder / "trajectory.tum").write_text(tum_lines(result.stamps, result.poses), encoding="utf-8")
     path = folder / "metrics.json"

@@ -138,12 +138,8 @@ class DataAssociation:
             return
         T = self._graph.pose(k)
         open_boxes = [frame.boxes[n] for n in rows]
-        near = [
-            j
-            for j in self._graph.landmarks
-            if j not in taken and self._graph.is_solved(j) and self._in_question(T, j, open_boxes)
-        ]
-        covariances = self._covariances_after(k - 1, near, step)
+        free = [j for j in self._graph.landmarks if j not in taken and self._graph.is_solved(j)]
+        covariances = self._covariances_after(k - 1, self._in_question(T, free, open_boxes), step)
         classes = [tracks[frame.tracks[n]].class_id for n in rows]
         for r, j in self._matched(T, covariances, open_boxes, classes, self.settings):
             self._vote_for(frame.tracks[rows[r]], j)
@@ -203,14 +199,15 @@ class DataAssociation:
         found = predict(T_map_camera, self._graph.quadric(j), covariance, self.camera.K, box, settings.model_error)
         return found and Prediction(*found, self._assignments.class_of_quadric(j))
 
-    def _in_question(self, T_map_camera: Array, j: int, boxes: list[BoxMeasurement]) -> bool:
-        """Whether one of these boxes may be of a quadric: worth the cost of its joint covariance with the pose."""
-        for columns in cut_alike(boxes):
-            predicted = predicted_corners(T_map_camera, self._graph.quadric(j), self.camera.K, boxes[columns[0]])
-            measured = np.stack([boxes[n].corners for n in columns])
-            if predicted is not None and overlap(predicted[None], measured).max() >= self.settings.min_overlap:
-                return True
-        return False
+    def _in_question(self, T_map_camera: Array, quadrics: list[int], boxes: list[BoxMeasurement]) -> list[int]:
+        """Those quadrics that one of these boxes may be of: worth the cost of a joint covariance with the pose."""
+        alike = [(boxes[columns[0]], np.stack([boxes[n].corners for n in columns])) for columns in cut_alike(boxes)]
+
+        def may_be(j: int, box: BoxMeasurement, measured: Array) -> bool:
+            predicted = predicted_corners(T_map_camera, self._graph.quadric(j), self.camera.K, box)
+            return predicted is not None and bool(overlap(predicted[None], measured).max() >= self.settings.min_overlap)
+
+        return [j for j in quadrics if any(may_be(j, *group) for group in alike)]
 
     def _vote_for(self, track: int, landmark: int) -> None:
         decided = self._votes.add(track, landmark)

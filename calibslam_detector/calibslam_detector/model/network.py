@@ -132,6 +132,15 @@ class CalibratedDetector(nn.Module):
         self.familiarity = Familiarity(self.detector.backbone.out_channels)
         self.covariance_head = CovarianceHead(self.detector.roi_heads.box_predictor.cls_score.in_features, classes)
 
+    def finds_boxes_as(self, other: CalibratedDetector) -> bool:
+        """Whether both find the same boxes, bit for bit, whatever they say of them."""
+        if (self.architecture, self.class_names) != (other.architecture, other.class_names):
+            return False
+        ours, theirs = self.detector.state_dict(), other.detector.state_dict()
+        return ours.keys() == theirs.keys() and all(
+            torch.equal(w.cpu(), theirs[name].cpu()) for name, w in ours.items()
+        )
+
     def forward(self, images: list[Tensor], targets: list[dict[str, Tensor]] | None = None) -> dict[str, Tensor]:
         """Losses of the plain detector, of images (3, H, W) in [0, 1] and targets as torchvision has them."""
         losses: dict[str, Tensor] = self.detector(images, targets)

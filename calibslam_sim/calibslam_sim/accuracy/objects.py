@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
 from calibslam_backend.geometry.ellipsoid import Ellipsoid
-from calibslam_msgs_py.measurements import Array
+from calibslam_msgs_py.measurements import Array, QuadricEstimate
 from calibslam_sim.simulation.sampling import unit_cube
 
 MAX_CENTRE_DISTANCE = 0.5  # [m] farther apart, an estimate is not of this object
@@ -22,6 +22,12 @@ class MapObject:
 
     class_id: str
     ellipsoid: Ellipsoid
+
+
+def map_objects(quadrics: Iterable[QuadricEstimate], T_world_map: Array | None = None) -> list[MapObject]:
+    """The objects of a map, in the frame to which (4, 4) leads; None: in the map's own."""
+    T = np.eye(4) if T_world_map is None else T_world_map
+    return [MapObject(q.class_id, Ellipsoid(T @ q.T_map_object, q.radii)) for q in quadrics]
 
 
 @dataclass(frozen=True)

@@ -5,14 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from calibslam_backend.geometry.ellipsoid import Ellipsoid
 from calibslam_backend.odometry.motion_chain import OdometryDifferencer
 from calibslam_backend.output.metrics import Trajectory
 from calibslam_msgs_py.bags import BagError, BagReader
 from calibslam_msgs_py.conversions import odometry_from_msg, quadrics_from_msg, stamped_pose_from_msg
 from calibslam_msgs_py.measurements import InvalidMeasurement, RelativeMotion, StampedPose
 from calibslam_sim import topics
-from calibslam_sim.accuracy.objects import MapObject
+from calibslam_sim.accuracy.objects import MapObject, map_objects
 from calibslam_sim.tum_folder import TumError, read_trajectory
 
 
@@ -82,8 +81,7 @@ def _from_bag(path: Path) -> Reference:
                     if motion is not None:
                         motions.append(motion)
                 else:
-                    quadrics = quadrics_from_msg(message)
-                    objects = [MapObject(q.class_id, Ellipsoid(q.T_map_object, q.radii)) for q in quadrics]
+                    objects = map_objects(quadrics_from_msg(message))
             except InvalidMeasurement:
                 continue  # the back end has counted and reported it
     if len(poses) < 2:

@@ -12,13 +12,9 @@ from calibslam_detector.images.coco_data import to_tensor
 from calibslam_detector.model import weights_file
 from calibslam_detector.model.box_covariance import rescaled
 from calibslam_detector.model.detector import Detector, DetectorSettings
-from calibslam_detector.model.network import CalibratedDetector
 from calibslam_msgs_py.covariance import symmetric
 from calibslam_msgs_py.measurements import Boxes
 from calibslam_sim.experiments.design import ExperimentError
-
-# Begins of the names of what does not find boxes: what is said of them, and which images are usual.
-NOT_OF_DETECTOR = ("covariance_head.", "familiarity.")
 
 
 class CovarianceHeads:
@@ -38,7 +34,7 @@ class CovarianceHeads:
             raise ExperimentError(str(error)) from error
         (first, model), *others = self._models.items()
         for name, other in others:
-            if not _same_detector(model, other):
+            if not model.finds_boxes_as(other):
                 raise ExperimentError(
                     f"{files[name]} finds other boxes than {files[first]}: only their covariances are to be compared; "
                     "train both with --stage covariance from the same --weights"
@@ -71,11 +67,3 @@ class CovarianceHeads:
             )
             for name, of_head in covariances.items()
         }
-
-
-def _same_detector(a: CalibratedDetector, b: CalibratedDetector) -> bool:
-    """Whether they find the same boxes."""
-    if (a.architecture, a.class_names) != (b.architecture, b.class_names):
-        return False
-    ours, theirs = a.state_dict(), b.state_dict()
-    return all(torch.equal(ours[name], theirs[name]) for name in ours if not name.startswith(NOT_OF_DETECTOR))

@@ -123,7 +123,8 @@ def conditions(settings: ImageSettings) -> list[str]:
         ExperimentError: the detectors cannot be used.
     """
     heads(settings.weights, settings.nll_weights)  # before any process is started
-    return [name for name in NOISE if name != NLL or NLL in files(settings.weights, settings.nll_weights)]
+    there = files(settings.weights, settings.nll_weights)
+    return [name for name, (head, _) in NOISE.items() if head in there]
 
 
 def comparisons(settings: ImageSettings) -> list[tuple[str, str]]:

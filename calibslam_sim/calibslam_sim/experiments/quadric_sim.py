@@ -16,13 +16,12 @@ import numpy as np
 
 from calibslam_backend.association.matching import ESTIMATED, GIVEN
 from calibslam_backend.estimator import EstimatorSettings
-from calibslam_backend.geometry.ellipsoid import Ellipsoid
 from calibslam_backend.graph.noise import CALIBRATED as OWN_COVARIANCE
 from calibslam_backend.graph.noise import FIXED, QUADRICSLAM
 from calibslam_backend.output.metrics import Trajectory, alignment
 from calibslam_backend.output.object_map import ObjectMap
 from calibslam_msgs_py.settings import setting
-from calibslam_sim.accuracy.objects import MapObject, object_accuracy
+from calibslam_sim.accuracy.objects import MapObject, map_objects, object_accuracy
 from calibslam_sim.experiments.design import (
     CALIBRATED,
     OVERCONFIDENT,
@@ -87,7 +86,7 @@ def accuracy(result: ObjectMap, recording: Simulation) -> Metrics:
     truth = Trajectory(recording.times, recording.T_world_camera)
     T_world_map = alignment(Trajectory(np.array(result.stamps), result.poses), truth)
     objects = object_accuracy(
-        [MapObject(q.class_id, Ellipsoid(T_world_map @ q.T_map_object, q.radii)) for q in result.quadrics],
+        map_objects(result.quadrics, T_world_map),
         [MapObject(thing.class_id, thing.ellipsoid) for thing in recording.world],
     )
     return {
