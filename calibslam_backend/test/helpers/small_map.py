@@ -54,7 +54,7 @@ class World:
         k = len(self.books.frames)
         T = self.graph.pose(k) if seen_from is None else seen_from
         corners = [
-            box_of_visible_part(T, self.cup(place), CAMERA.K, image_bounds(640, 480), ~ALL_EDGES)[1]
+            box_of_visible_part(T, self.cup(place), CAMERA.K, image_bounds(640, 480), ALL_EDGES)[1]
             for place, _ in seen
         ]
         n, tracks = len(seen), [track for _, track in seen]
