@@ -1,4 +1,4 @@
-"""How far a long job is: a line that is rewritten on a terminal, a few lines elsewhere."""
+"""How far a long job is, and how long it takes: a line that is rewritten on a terminal, a few lines elsewhere."""
 
 from __future__ import annotations
 
@@ -9,6 +9,8 @@ from typing import TextIO
 
 SECONDS_BETWEEN_UPDATES = 0.5
 SHARE_BETWEEN_LINES = 0.25  # where the output is no terminal
+SECONDS_BETWEEN_LINES = 60.0  # there, at most
+SECONDS_TO_JUDGE = 10.0  # before what is left is told from what has been done
 
 
 class Progress:
@@ -23,7 +25,7 @@ class Progress:
         self._stream = sys.stderr if stream is None else stream
         self._terminal = self._stream.isatty()
         self._done = 0.0
-        self._shown_at = time.monotonic()
+        self._began = self._shown_at = time.monotonic()
         self._shown = 0.0
         self._line_open = False
 
@@ -45,16 +47,25 @@ class Progress:
         """So much is done."""
         self._done = done
         now = time.monotonic()
-        if now - self._shown_at < SECONDS_BETWEEN_UPDATES:
+        waited = now - self._shown_at
+        if waited < SECONDS_BETWEEN_UPDATES:
             return
         share = min(done / self._total, 1.0) if self._total > 0.0 else 1.0
+        line = f"{self._what}: {share:4.0%}{_left(now - self._began, share)}"
         if self._terminal:
-            self._stream.write(f"\r{self._what}: {share:4.0%}")
+            self._stream.write(f"\r{line}\x1b[K")  # and nothing after it of a line that was longer
             self._line_open = True
-        elif share - self._shown >= SHARE_BETWEEN_LINES:
-            self._stream.write(f"{self._what}: {share:4.0%}\n")
-            self._shown = share
+        elif share - self._shown >= SHARE_BETWEEN_LINES or waited >= SECONDS_BETWEEN_LINES:
+            self._stream.write(f"{line}\n")
         else:
             return
         self._stream.flush()
-        self._shown_at = now
+        self._shown_at, self._shown = now, share
+
+
+def _left(seconds: float, share: float) -> str:
+    """What is left if it goes on as it did: nothing to say at the beginning and at the end."""
+    if seconds < SECONDS_TO_JUDGE or not 0.0 < share < 1.0:
+        return ""
+    left = seconds * (1.0 - share) / share
+    return f", {left:.0f} s left" if left < 100.0 else f", {left / 60.0:.0f} min left"
