@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -54,7 +55,7 @@ def _doubles_of_all(arrays: list[Any], n: int, what: str) -> Array:
 
 
 def valid_boxes(boxes: Boxes) -> tuple[Boxes, dict[str, int]]:
-    """The usable boxes, and how many were dropped for which reason.
+    """The usable boxes, cut at the image border, and how many were dropped for which reason.
 
     Reasons: `nan` (corner or score not finite, or a corner farther than `LARGEST_COORDINATE` away), `empty` (xmin >=
     xmax or ymin >= ymax), `outside` (no part of the box in the image), `covariance` (known, but not finite, symmetric
@@ -78,7 +79,11 @@ def valid_boxes(boxes: Boxes) -> tuple[Boxes, dict[str, int]]:
         if count := int((keep & defect).sum()):
             rejected[reason] = count
         keep &= ~defect
-    return (boxes if keep.all() else boxes.select(np.flatnonzero(keep))), rejected
+    if not keep.all():
+        boxes = boxes.select(np.flatnonzero(keep))
+    # Some detectors draw what they believe to be beyond the image.
+    inside = np.clip(boxes.corners, 0.0, [boxes.width, boxes.height] * 2)
+    return (boxes if (inside == boxes.corners).all() else replace(boxes, corners=inside)), rejected
 
 
 def boxes_to_msg(boxes: Boxes, types: MessageTypes) -> Any:

@@ -123,9 +123,14 @@ def test_good_boxes_are_kept_beside_bad_ones() -> None:
     assert (kept.class_ids, rejected) == (("7",), {"nan": 1})
 
 
-def test_box_partly_outside_and_of_unknown_covariance_is_valid() -> None:
-    kept, rejected = c.valid_boxes(with_box([-5.0, -5.0, 5.0, 5.0], np.full((4, 4), np.nan)))
+@pytest.mark.parametrize(
+    ("drawn", "cut"),
+    [([-5.0, -6.0, 5.0, 5.0], [0.0, 0.0, 5.0, 5.0]), ([600.0, 400.0, 755.0, 481.0], [600.0, 400.0, 640.0, 480.0])],
+)
+def test_a_box_partly_outside_is_cut_at_the_border(drawn: list[float], cut: list[float]) -> None:
+    kept, rejected = c.valid_boxes(with_box(drawn, np.full((4, 4), np.nan)))
     assert len(kept) == 1 and not rejected
+    np.testing.assert_array_equal(kept.corners, [cut])
 
 
 def test_nan_covariance_in_a_message_is_a_defect_and_not_unknown(types: c.MessageTypes) -> None:
