@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import gtsam
 import numpy as np
 import pytest
 from small_world import CAMERA, SmallWorld, around, objects
@@ -46,6 +47,25 @@ def test_directions_left_open(axes: list[int], variance: float) -> None:
     estimator = drive(motions)
     assert len(estimator.stamps) > 20
     assert error(estimator) < 0.02
+
+
+TURNED = gtsam.Pose3(gtsam.Rot3.Ypr(-1.4, 0.2, -1.6), np.array([0.3, 0.05, 0.4])).matrix()
+
+
+@pytest.mark.parametrize("variance", [1e6, 1e12, 1e15])
+def test_directions_left_open_by_a_body_that_carries_the_camera_turned(variance: float) -> None:
+    """In the camera's axes they are mixed with others, and what is left open there is rounded more coarsely than those
+    are known."""
+    back = np.linalg.inv(TURNED)
+    estimator = Estimator(CAMERA, TURNED, EstimatorSettings())
+    stated = np.diag([variance, variance, 1e-5, 1e-5, 1e-5, variance])
+    for measured in WORLD.measurements():
+        if isinstance(measured, RelativeMotion):
+            measured = replace(measured, T_start_end=TURNED @ measured.T_start_end @ back, covariance=stated)
+        estimator.add(measured)
+    estimator.finish()
+    assert len(estimator.stamps) > 20
+    assert error(estimator) < 0.03
 
 
 @pytest.mark.parametrize("metres", [50.0, 1e4, 1e9, 1e300])

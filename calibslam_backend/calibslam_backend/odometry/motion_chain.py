@@ -105,6 +105,8 @@ class MotionChain:
     UNSEEN_MOTION = 1.0
     # A standard deviation [rad, m] of one step that says: not measured.
     OPEN = 1.0
+    # One that says it as well as any larger one, and beside which those of other directions are more than rounding.
+    LARGEST = 1e3
     SHORTEST = 0.03  # [s]: a shorter step leaves no less open
 
     def __init__(self, noise: MotionNoise, T_body_camera: Array) -> None:
@@ -136,11 +138,8 @@ class MotionChain:
         if motion.end <= motion.start:
             raise InvalidMeasurement("time_backwards", f"motion from {motion.start} to {motion.end} ns ends first")
         covariance = motion.covariance
-        if covariance is not None:
-            if not np.isfinite(covariance).all() or np.linalg.eigvalsh(covariance)[0] <= 0.0:
-                raise InvalidMeasurement("covariance", f"covariance at {motion.end} ns is not positive definite")
-            to_camera = self._extrinsic.inverse().AdjointMap()
-            covariance = to_camera @ covariance @ to_camera.T
+        if covariance is not None and (not np.isfinite(covariance).all() or np.linalg.eigvalsh(covariance)[0] <= 0.0):
+            raise InvalidMeasurement("covariance", f"covariance at {motion.end} ns is not positive definite")
         last = self.end
         if last is None:
             last = motion.start
@@ -158,14 +157,16 @@ class MotionChain:
             self._failures.unseen(gap)
         seconds = (motion.end - motion.start) / SECOND
         measured = self._extrinsic.inverse() * gtsam.Pose3(motion.T_start_end) * self._extrinsic
-        believed = self._failures.believe(gtsam.Pose3.Logmap(measured) / seconds, seconds, covariance)
+        stated = None if covariance is None else self._in_camera(covariance)
+        believed = self._failures.believe(gtsam.Pose3.Logmap(measured) / seconds, seconds, stated)
         step = gtsam.Pose3.Expmap(believed.velocity * seconds) if believed.variance.any() else measured
         unseen = np.sqrt(believed.variance)
-        if covariance is None:
+        if covariance is None or stated is None:
             noise = self._noise.covariance(believed.velocity, seconds)
         else:
-            noise = self._closed(covariance, seconds)
-            is_open = np.diag(covariance) > self.OPEN**2
+            # Closed as it is stated: in another frame, an open direction's rounding is larger than what others are.
+            noise = self._in_camera(self._closed(covariance, seconds))
+            is_open = np.diag(stated) > self.OPEN**2
             unseen = np.where(is_open, np.minimum(unseen, self.UNSEEN_MOTION), unseen)
         before = self._steps[-1]
         self._steps.append(
@@ -180,6 +181,11 @@ class MotionChain:
         )
         return "odometry_implausible" if believed.failed > 0.5 else problem
 
+    def _in_camera(self, covariance: Array) -> Array:
+        """(6, 6) of a motion of the body, at its end, as one of the camera."""
+        to_camera = self._extrinsic.inverse().AdjointMap()
+        return np.asarray(to_camera @ covariance @ to_camera.T)
+
     def _closed(self, covariance: Array, seconds: float) -> Array:
         """A covariance (6, 6) with the directions that odometry leaves open bounded by what a body does unseen.
 
@@ -188,7 +194,8 @@ class MotionChain:
         """
         if np.diag(covariance).max() <= self.OPEN**2:
             return covariance
-        variances, axes = np.linalg.eigh(covariance)
+        scale = np.minimum(self.LARGEST / np.sqrt(np.diag(covariance)), 1.0)
+        variances, axes = np.linalg.eigh(scale[:, None] * covariance * scale)
         unseen = (self.UNSEEN_MOTION * max(seconds, self.SHORTEST)) ** 2
         return np.asarray(
             (axes * np.where(variances > self.OPEN**2, np.minimum(variances, unseen), variances)) @ axes.T
