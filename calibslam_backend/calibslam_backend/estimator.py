@@ -371,7 +371,7 @@ class Estimator:
         else:
             predicted = self._graph.predict(motion)
             if k % self.NIS_EVERY == 0:
-                nis = objects.innovations(frame, predicted, motion.covariance)
+                nis = objects.innovations(frame, predicted, motion)
             guess = objects.localise(frame, predicted, motion.covariance)
             self._graph.add_pose(motion, guess)
         self.stamps.append(boxes.stamp)
@@ -380,7 +380,7 @@ class Estimator:
         if found is not None:
             objects.bind_found(frame, found)
         if motion is not None:
-            objects.vote(k, motion.covariance)
+            objects.vote(k, motion)
         self._note(self._graph.update())
         self._upkeep.merge()
         self._chores = self._chores_of(k)

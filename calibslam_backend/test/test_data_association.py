@@ -11,7 +11,8 @@ from small_map import CAMERA, FRAMES, LEFT, RIGHT, World
 from calibslam_backend.association.matching import GIVEN, predicted_corners
 from calibslam_backend.geometry.box_measurement import cut_alike
 from calibslam_backend.graph.measured import Motion
-from calibslam_msgs_py.measurements import Array
+from calibslam_backend.graph.noise import QUADRICSLAM
+from calibslam_msgs_py.measurements import Array, Boxes
 
 AT_BORDER = (-0.73, 0.0, 2.0)  # its left half is outside the image of the last keyframe, where odometry is right
 BESIDE_IT = (-0.63, 0.0, 2.0)
@@ -96,3 +97,24 @@ def test_what_may_be_of_either_stays_open(x: float) -> None:
 @pytest.mark.parametrize("settings", [{"name": "bottle"}, {"association": GIVEN}])
 def test_other_classes_and_given_identities_are_left_alone(settings: dict[str, str]) -> None:
     assert lost((LEFT, 0), (RIGHT, 1), **settings).objects.give_open(FRAMES) == 0
+
+
+def test_quadricslam_knows_the_boxes_that_a_track_had_before_it_was_bound() -> None:
+    """The spread of sizes is that of the object, not of what was seen of it since it has a quadric (eq. 4.3.1)."""
+    world = World(noise_model=QUADRICSLAM)
+    boxes = [Boxes(k, 640, 480, np.array([[100.0, 100.0, 120.0 + 10.0 * (k % 2), 120.0]]), np.full((1, 4, 4), np.nan),
+                   ("cup",), np.ones(1), ("",)) for k in range(4)]  # fmt: skip
+    variances = []
+    for k, each in enumerate(boxes):
+        world.books.see([0], each.class_ids)
+        frame = world.objects.frame(each, [0])
+        variances.append(frame.boxes[0].covariance[0, 0])
+        world.books.frames.append(frame)
+        world.books.tracks[0].seen.append((k, 0))
+        if k == 1:
+            world.books.know(0, world.cup(LEFT), np.eye(9), Counter(cup=1))
+            world.objects.bind(0, 0)
+        elif k > 1:
+            world.books.give(k, 0, 0)
+    # Widths 20, 30, 20, 30: no spread yet (5 px), then deviations 5, sqrt(200 / 9) and 5.
+    np.testing.assert_allclose(variances, [25.0, 25.0, 200.0 / 9.0, 25.0])

@@ -132,6 +132,13 @@ class Assignments:
         quadrics = [self.tracks[track].quadric for track in frame.tracks]
         return [(j, box) for j, box in zip(quadrics, frame.boxes, strict=True) if j is not None]
 
+    def boxes_of_object(self, track: int) -> list[BoxMeasurement]:
+        """Those of the quadric that a track is bound to, or its own as long as it is open."""
+        candidate = self.tracks[track]
+        if candidate.quadric is None:
+            return [self.frames[k].boxes[n] for k, n in candidate.seen]
+        return list(self.graph.landmarks[candidate.quadric].boxes.values())
+
     def open_rows(self, candidate: Candidate) -> list[tuple[int, int]]:
         """Boxes of a track, (keyframe, row), that are given to no quadric."""
         return [(k, n) for k, n in candidate.seen if self.frames[k].quadrics[n] is None]

@@ -29,8 +29,9 @@ from calibslam_backend.association.matching import (
 from calibslam_backend.association.relocalisation import Relocalised, relocalise
 from calibslam_backend.association.tracking import overlap
 from calibslam_backend.estimator_settings import EstimatorSettings
-from calibslam_backend.geometry.box_measurement import BoxMeasurement, cut_alike, prepare
-from calibslam_backend.graph.noise import NoiseModel, spread
+from calibslam_backend.geometry.box_measurement import BoxMeasurement, cut_alike, prepare, undistorted
+from calibslam_backend.graph.measured import Motion
+from calibslam_backend.graph.noise import box_covariance, spread
 from calibslam_backend.graph.object_graph import ObjectGraph, UpdateReport
 from calibslam_msgs_py.measurements import Array, Boxes, Camera
 
@@ -56,7 +57,6 @@ class DataAssociation:
         self._assignments = assignments
         self._graph: ObjectGraph = assignments.graph
         self._anywhere = replace(settings, min_overlap=0.0)  # boxes need not lie where they are expected
-        self._noise = NoiseModel(settings)
         self._votes = Votes(settings.votes)
         # (bound quadric, the one that it was found to be) -> tracks of which it was found.
         self._taken_for: dict[tuple[int, int], set[int]] = {}
@@ -64,11 +64,10 @@ class DataAssociation:
     def frame(self, boxes: Boxes, tracks: list[int]) -> Frame:
         """The boxes of an image made ready, with the covariances the noise model gives them."""
         covariances = np.empty((len(boxes), 4, 4))
+        corners = undistorted(boxes.corners, self.camera)
         for i, track in enumerate(tracks):
-            quadric = self._assignments.tracks[track].quadric
-            key = ~track if quadric is None else quadric
-            self._noise.observe(key, boxes.corners[i])
-            covariances[i] = self._noise.covariance(key, boxes.covariances[i])
+            before = [box.corners for box in self._assignments.boxes_of_object(track)]
+            covariances[i] = box_covariance(self.settings, boxes.covariances[i], [*before, corners[i]])
         measurements = prepare(boxes, covariances, self.camera)
         return Frame(measurements, tracks, boxes.class_ids, boxes.object_ids, [None] * len(boxes))
 
@@ -82,20 +81,18 @@ class DataAssociation:
         scales = s.robust_scale, s.robust_odometry
         return localise(predicted, covariance, quadrics, boxes, self.camera.K, *scales, self._graph.correlation.worth)
 
-    def innovations(self, frame: Frame, predicted: Array, covariance: Array) -> Array:
-        """Normalised innovations squared of the boxes of bound tracks; arguments as in `localise`."""
+    def innovations(self, frame: Frame, predicted: Array, motion: Motion) -> Array:
+        """Normalised innovations squared of the boxes of bound tracks, after a motion to a predicted pose (4, 4)."""
         known = [(j, box) for j, box in self._assignments.bound(frame) if self._graph.is_solved(j)]
         ids = sorted({j for j, _ in known})
-        joint = self._covariances_after(len(self._assignments.frames) - 1, ids, covariance)
+        joint = self._covariances_after(len(self._assignments.frames) - 1, ids, motion)
         vectors, boxes = [self._graph.quadric(j) for j, _ in known], [box for _, box in known]
         return innovations(predicted, vectors, [joint[j] for j, _ in known], boxes, self.camera.K)
 
-    def _covariances_after(self, k: int, quadrics: list[int], step: Array) -> dict[int, Array]:
-        """For each of these quadrics (15, 15) of it and of a pose that is a step (6, 6) after that of keyframe k."""
+    def _covariances_after(self, k: int, quadrics: list[int], motion: Motion) -> dict[int, Array]:
+        """For each of these quadrics (15, 15) of the pose to which a motion leads from keyframe k, and of it."""
         joint = self._graph.joint_covariances(k, quadrics)
-        for each in joint.values():
-            each[:6, :6] += step
-        return joint
+        return {j: motion.carried(covariance) for j, covariance in joint.items()}
 
     def add(self, frame: Frame) -> int:
         """The boxes of the newest keyframe; those of bound tracks go to their quadrics. Returns how many."""
@@ -126,9 +123,9 @@ class DataAssociation:
 
     # -- quadrics that are known --------------------------------------------------------------------------------
 
-    def vote(self, k: int, step: Array) -> None:
-        """Open tracks of keyframe k, a step of covariance (6, 6) after the last one, vote for the quadrics that explain
-        their boxes."""
+    def vote(self, k: int, motion: Motion) -> None:
+        """Open tracks of keyframe k, to which a motion led from the last one, vote for the quadrics that explain their
+        boxes."""
         if self.settings.association == GIVEN:
             return
         tracks, frame = self._assignments.tracks, self._assignments.frames[k]
@@ -139,7 +136,7 @@ class DataAssociation:
         T = self._graph.pose(k)
         open_boxes = [frame.boxes[n] for n in rows]
         free = [j for j in self._graph.landmarks if j not in taken and self._graph.is_solved(j)]
-        covariances = self._covariances_after(k - 1, self._in_question(T, free, open_boxes), step)
+        covariances = self._covariances_after(k - 1, self._in_question(T, free, open_boxes), motion)
         classes = [tracks[frame.tracks[n]].class_id for n in rows]
         for r, j in self._matched(T, covariances, open_boxes, classes, self.settings):
             self._vote_for(frame.tracks[rows[r]], j)

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+import gtsam
+import numpy as np
+
 from calibslam_backend.geometry.box_measurement import BoxMeasurement
 from calibslam_msgs_py.measurements import Array
 
@@ -23,6 +26,15 @@ class Motion:
     covariance: Array
     drifts: float
     measured: Array
+
+    def carried(self, covariance: Array) -> Array:
+        """(15, 15) of a pose and a quadric -> (15, 15) of the pose to which the motion leads from there, and of it."""
+        # An error of a pose is told in its body; from the next one it looks different: a turn there is a shift here.
+        to_end = np.eye(15)
+        to_end[:6, :6] = gtsam.Pose3(self.T).inverse().AdjointMap()
+        after = to_end @ covariance @ to_end.T
+        after[:6, :6] += self.covariance
+        return np.asarray(after)
 
 
 @dataclass

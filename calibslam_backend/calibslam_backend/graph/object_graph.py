@@ -194,6 +194,9 @@ class ObjectGraph:
         The optimisation starts from `guess` (4, 4), its pose in the map.
         """
         k = self.size
+        factor = motion_factor(
+            x(k - 1), x(k), D, motion.T, motion.covariance, motion.drifts, self._settings.robust_odometry
+        )
         self._motions.append(motion)
         if motion.drifts and not self._drifts:
             self._drifts = True
@@ -202,9 +205,6 @@ class ObjectGraph:
             self._smoother.add("drift", gtsam.PriorFactorVector(D, np.zeros(DRIFT), noise))
         self._smoother.insert(x(k), gtsam.Pose3(guess))
         self._linearised = np.append(self._linearised, guess[None], axis=0)
-        factor = motion_factor(
-            x(k - 1), x(k), D, motion.T, motion.covariance, motion.drifts, self._settings.robust_odometry
-        )
         self._smoother.add(("motion", k), factor)
         if k > self.NEW_POSES:
             self._learn_motion(k - self.NEW_POSES)
@@ -287,10 +287,11 @@ class ObjectGraph:
 
     def _rebuild(self, values: gtsam.Values) -> None:
         """The tree anew, all of it linearised at these values."""
+        poses, worth = self._poses(values).copy(), self.correlation.worth
         self._smoother.rebuild(values, self._last())
-        self._linearised = self.poses()
+        self._linearised = poses  # and not where the solution is
         for j, landmark in self.landmarks.items():
-            landmark.linearised = dict.fromkeys(landmark.boxes, (values.atVector(q(j)), self.correlation.worth))
+            landmark.linearised = dict.fromkeys(landmark.boxes, (values.atVector(q(j)), worth))
 
     def _linearise_boxes(self, names: Iterable[Hashable], values: gtsam.Values) -> dict[Hashable, gtsam.JacobianFactor]:
         """The tangents of those of these factors that are boxes."""
