@@ -159,6 +159,25 @@ def test_forgetting_changes_nothing_that_is_still_asked() -> None:
         np.testing.assert_allclose(a, b, atol=1e-12)
 
 
+@pytest.mark.parametrize("known", [True, False])
+def test_odometry_that_no_image_follows_is_joined(monkeypatch: pytest.MonkeyPatch, known: bool) -> None:
+    """A camera that is off for hours costs no memory, and what happened in the meantime is known as well as ever."""
+    rng = np.random.default_rng(5)
+    motions = [motion(k, exp(rng.normal(0.0, 0.02, 6)), COVARIANCE if known or k % 3 else None) for k in range(1000)]
+    motions[300:310] = []  # and a gap
+    whole, joined = (MotionChain(NEVER_FAILS, EXTRINSIC.matrix()) for _ in range(2))
+    monkeypatch.setattr(joined, "MOST", 100)
+    for each in motions:
+        assert whole.add(each) == joined.add(each)
+    assert len(joined._steps) <= 100 < len(whole._steps)
+    kept = [step.end for step in joined._steps]
+    for start, end in ((kept[0], kept[-1]), (kept[1], kept[20]), (kept[5], kept[-1] - STEP // 3)):
+        for found, expected in zip(joined.between(start, end), whole.between(start, end), strict=True):
+            np.testing.assert_allclose(found, expected, atol=1e-9 * np.abs(expected).max())
+        np.testing.assert_allclose(joined.measured(start, end), whole.measured(start, end), atol=1e-9)
+        assert joined.drifts(start, end) == pytest.approx(whole.drifts(start, end))
+
+
 def test_a_gap_is_bridged_with_an_honest_covariance() -> None:
     """Half a second without odometry: no motion, but 0.5 rad and 0.5 m of uncertainty."""
     chain = chain_of([motion(0, gtsam.Pose3())])

@@ -82,7 +82,7 @@ class _Step:
         measured: the same, nothing bridged.
         covariance: (6, 6) of the motion, in the camera at its end.
         unseen: (6,) what the body may have done unseen besides [rad, m].
-        drifts: whether odometry's constant drift is in it.
+        drifts: how long [s] odometry's constant drift acts in it.
     """
 
     end: int
@@ -90,7 +90,7 @@ class _Step:
     measured: gtsam.Pose3
     covariance: Array
     unseen: Array
-    drifts: bool
+    drifts: float
 
 
 class MotionChain:
@@ -107,6 +107,8 @@ class MotionChain:
     OPEN = 1.0
     # One that says it as well as any larger one, and beside which those of other directions are more than rounding.
     LARGEST = 1e3
+    # Steps that are kept, as many as no camera needs: if no image comes, the older half of them is joined in tens.
+    MOST, JOINED = 10_000, 10
     SHORTEST = 0.03  # [s]: a shorter step leaves no less open
 
     def __init__(self, noise: MotionNoise, T_body_camera: Array) -> None:
@@ -176,9 +178,11 @@ class MotionChain:
                 before.measured * measured,
                 noise,
                 unseen * seconds,
-                drifts=covariance is None,
+                drifts=seconds if covariance is None else 0.0,
             )
         )
+        if len(self._steps) > self.MOST:
+            self._join_older()
         return "odometry_implausible" if believed.failed > 0.5 else problem
 
     def _in_camera(self, covariance: Array) -> Array:
@@ -205,7 +209,7 @@ class MotionChain:
         """Nothing is measured up to this time, and the body may do so much [rad, m]."""
         origin = gtsam.Pose3()
         pose, measured = (self._steps[-1].pose, self._steps[-1].measured) if self._steps else (origin, origin)
-        self._steps.append(_Step(time, pose, measured, np.zeros((6, 6)), np.full(6, unseen), drifts=False))
+        self._steps.append(_Step(time, pose, measured, np.zeros((6, 6)), np.full(6, unseen), drifts=0.0))
 
     def motion(self, start: int, end: int) -> Array:
         """(4, 4) of the camera from start to end [ns], which must lie inside the chain."""
@@ -214,12 +218,18 @@ class MotionChain:
     def between(self, start: int, end: int) -> tuple[Array, Array]:
         """`motion` and its covariance (6, 6) [rotation, translation]."""
         first, last = self._pose_at(start), self._pose_at(end)
+        covariance, unseen = self._uncertainty(start, end)
+        return np.asarray(first.between(last).matrix()), covariance + np.diag(unseen**2)
+
+    def _uncertainty(self, start: int, end: int) -> tuple[Array, Array]:
+        """Of the motion between two times [ns]: its covariance (6, 6), and what the body may have done unseen (6,)."""
+        last = self._pose_at(end)
         covariance, unseen = np.zeros((6, 6)), np.zeros(6)
-        for step, share, _ in self._inside(start, end):
+        for step, share in self._inside(start, end):
             unseen += share * step.unseen  # of one wrong velocity, hence not in squares
             to_end = last.between(self._pose_at(min(end, step.end))).AdjointMap()
             covariance += to_end @ (share * step.covariance) @ to_end.T
-        return np.asarray(first.between(last).matrix()), covariance + np.diag(unseen**2)
+        return covariance, unseen
 
     def measured(self, start: int, end: int) -> Array:
         """Motion (4, 4) of the camera from start to end [ns] as odometry said, possible or not."""
@@ -227,7 +237,7 @@ class MotionChain:
 
     def drifts(self, start: int, end: int) -> float:
         """How long [s] the motion from start to end [ns] drifts: in steps whose covariance is not known."""
-        return sum(seconds for step, _, seconds in self._inside(start, end) if step.drifts)
+        return sum(share * step.drifts for step, share in self._inside(start, end))
 
     def forget_before(self, time: int) -> None:
         """Drop what is not needed to read times from `time` [ns] on."""
@@ -237,14 +247,22 @@ class MotionChain:
         """Which is the first step that ends after this time."""
         return bisect_right(self._steps, time, key=lambda step: step.end)
 
-    def _inside(self, start: int, end: int) -> Iterator[tuple[_Step, float, float]]:
-        """The steps between two times [ns], the share of each that lies between them, and how long [s] that is."""
+    def _join_older(self) -> None:
+        """A motion between times that stay is the same as before."""
+        joined = [self._steps[0]]
+        for i in range(self.JOINED, self.MOST // 2, self.JOINED):
+            last, interval = self._steps[i], (joined[-1].end, self._steps[i].end)
+            joined.append(_Step(last.end, last.pose, last.measured, *self._uncertainty(*interval), self.drifts(*interval)))
+        self._steps[: i + 1] = joined
+
+    def _inside(self, start: int, end: int) -> Iterator[tuple[_Step, float]]:
+        """The steps between two times [ns], and the share of each that lies between them."""
         for i in range(max(self._after(start), 1), len(self._steps)):
             before, step = self._steps[i - 1 : i + 1]
             duration = min(end, step.end) - max(start, before.end)
             if duration <= 0:
                 return
-            yield step, duration / (step.end - before.end), duration / SECOND
+            yield step, duration / (step.end - before.end)
 
     def _pose_at(self, time: int, which: str = "pose") -> gtsam.Pose3:
         i = self._after(time) - 1
