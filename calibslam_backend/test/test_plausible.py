@@ -31,7 +31,12 @@ def vector(centre: tuple[float, float, float], radii: tuple[float, float, float]
 def test_size_and_place_of_an_object(
     centre: tuple[float, float, float], radii: tuple[float, float, float], expected: bool
 ) -> None:
-    assert is_object(vector(centre, radii)[None], CAMERA).tolist() == [expected]
+    assert is_object(vector(centre, radii)[None], CAMERA[None]).tolist() == [expected]
+
+
+def test_what_no_camera_has_seen_yet_may_be_anywhere() -> None:
+    """The objects of a loaded map."""
+    assert is_object(vector((1e4, 0.0, 0.0), (0.1, 0.2, 0.3))[None], np.full((1, 3), np.nan)).tolist() == [True]
 
 
 @pytest.mark.parametrize("entry", range(9))
@@ -40,11 +45,11 @@ def test_what_is_not_finite_is_no_object(entry: int, value: float) -> None:
     good = vector((0.0, 0.0, 2.0), (0.1, 0.2, 0.3))
     bad = good.copy()
     bad[entry] = value
-    assert is_object(np.stack([bad, good]), CAMERA).tolist() == [False, True]
+    assert is_object(np.stack([bad, good]), np.stack([CAMERA, CAMERA])).tolist() == [False, True]
 
 
 def test_no_quadrics() -> None:
-    assert is_object(np.zeros((0, 9)), CAMERA).tolist() == []
+    assert is_object(np.zeros((0, 9)), np.zeros((0, 3))).tolist() == []
 
 
 @pytest.mark.parametrize(("angle", "distance", "expected"), [(0.49, 0.49, False), (0.51, 0.0, True), (0.0, 0.51, True)])

@@ -70,6 +70,7 @@ class ObjectGraph:
     IN_SIGHT = 10  # keyframes for which a quadric that was seen counts as one that will be seen again soon
     FAR = 0.05  # [rad, m] that a pose may be from the base of its coordinates
     WORTH_CHANGED = 0.1  # share by which a box's worth has to change for it to be relinearised
+    AT_ONCE = 30  # quadrics whose covariances are computed together: one by one and all at once take longer
     FOUND_SIGMA = 0.5  # [rad, m] of a pose found in a known map: its boxes say it better
 
     def __init__(self, K: Array, settings: GraphSettings, priors: PriorSettings, noise: MotionNoise) -> None:
@@ -158,13 +159,12 @@ class ObjectGraph:
 
     def quadric_covariances(self) -> dict[int, Array]:
         """For each quadric (9, 9) of its vector, like those of poses; its prior's where no update has been done yet."""
+        own = {j: landmark.prior for j, landmark in self.landmarks.items()}
         solved = [j for j in self.landmarks if self.is_solved(j)]
-        joint = self._smoother.joint([q(j) for j in solved]) if solved else None
-        own = {
-            j: np.asarray(joint.at(q(j), q(j))) if joint is not None and self.is_solved(j) else landmark.prior
-            for j, landmark in self.landmarks.items()
-        }
-        return {j: self.correlation.understated * covariance for j, covariance in own.items()}
+        for some in (solved[n : n + self.AT_ONCE] for n in range(0, len(solved), self.AT_ONCE)):
+            joint = self._smoother.joint([q(j) for j in some])
+            own.update({j: np.asarray(joint.at(q(j), q(j))) for j in some})
+        return {j: self.correlation.understated * own[j] for j in self.landmarks}
 
     def joint_covariances(self, k: int, quadrics: list[int]) -> dict[int, Array]:
         """For each of these quadrics (15, 15) of pose k and the quadric: columns of `box_of_visible_part`; the
@@ -274,12 +274,17 @@ class ObjectGraph:
             log.warning("%s; optimising the whole graph from the estimate before", reason)
             self._repair(before)
         ids, vectors = self.quadrics()
-        plausible = is_object(vectors, self.pose(self.size - 1)[:3, 3])
+        plausible = is_object(vectors, self._seen_from(ids))
         removed = [j for j, fine in zip(ids, plausible, strict=True) if not fine]
         for j in removed:
             log.warning("quadric %d ran away and is taken out", j)
             self.remove_quadric(j)
         return UpdateReport(removed, reason)
+
+    def _seen_from(self, quadrics: list[int]) -> Array:
+        """(M, 3) where a camera was that saw each of these quadrics [m]; NaN where none has."""
+        places = np.vstack([self._poses(self._smoother.values)[:, :3, 3], np.full(3, np.nan)])
+        return places[[next(reversed(self.landmarks[j].boxes), -1) for j in quadrics]]
 
     def optimise(self) -> None:
         """The batch optimum by Levenberg-Marquardt, from which the tree is built anew."""

@@ -13,17 +13,18 @@ LARGEST_RADIUS, LARGEST_DISTANCE, SMALLEST_RADIUS = 10.0, 200.0, 1e-4
 LARGEST_STEP = 0.5  # [rad, m] of a pose in one update; an undamped step that is larger cannot be trusted
 
 
-def is_object(vectors: Array, camera: Array) -> NDArray[np.bool_]:
-    """(M,) whether quadrics (M, 9) have the size of objects, and a place not too far from the camera (3,) [m]."""
+def is_object(vectors: Array, cameras: Array) -> NDArray[np.bool_]:
+    """(M,) whether quadrics (M, 9) have the size of objects, and places not too far from cameras (M, 3) that saw them
+    [m]; NaN: none did."""
     finite: NDArray[np.bool_] = np.all(np.isfinite(vectors), axis=1)
     known = np.where(finite[:, None], vectors, 0.0)
     radii = np.exp(np.linalg.eigvalsh(matrix_from_vector(known[:, 3:])))
-    away = np.linalg.norm(known[:, :3] - camera, axis=1)
+    away = np.linalg.norm(known[:, :3] - cameras, axis=1)
     return np.asarray(
         finite
         & (radii.min(axis=1) > SMALLEST_RADIUS)
         & (radii.max(axis=1) < LARGEST_RADIUS)
-        & (away < LARGEST_DISTANCE)
+        & ~(away >= LARGEST_DISTANCE)
     )
 
 

@@ -54,8 +54,7 @@ class World:
         k = len(self.books.frames)
         T = self.graph.pose(k) if seen_from is None else seen_from
         corners = [
-            box_of_visible_part(T, self.cup(place), CAMERA.K, image_bounds(640, 480), ALL_EDGES)[1]
-            for place, _ in seen
+            box_of_visible_part(T, self.cup(place), CAMERA.K, image_bounds(640, 480), ALL_EDGES)[1] for place, _ in seen
         ]
         n, tracks = len(seen), [track for _, track in seen]
         boxes = Boxes(k, 640, 480, np.reshape(corners, (n, 4)), np.tile(np.eye(4) * 4.0, (n, 1, 1)),
