@@ -52,7 +52,9 @@ def block(result: dict[str, Any], experiment: Experiment) -> str:
     parts = [f"```bash\n{result['command']}\n```", _markdown(rows)]
     tests = rows_of_pairs(result, metrics)
     if len(tests) > 1:
-        parts.append("Paired differences (negative: the first is better) with p of the paired t-test:")
+        shared = result.get("left_out")
+        note = "; where repetitions share most of their images, with their variance corrected for it" if shared else ""
+        parts.append(f"Paired differences (negative: the first is better) with p of the paired t-test{note}:")
         parts.append(_markdown(tests))
     notes = [
         f"{metrics[metric].title}: {low:.3g} to {high:.3g} (95 %) if the covariances are right."

@@ -251,8 +251,9 @@ class MotionChain:
         """A motion between times that stay is the same as before."""
         joined = [self._steps[0]]
         for i in range(self.JOINED, self.MOST // 2, self.JOINED):
-            last, interval = self._steps[i], (joined[-1].end, self._steps[i].end)
-            joined.append(_Step(last.end, last.pose, last.measured, *self._uncertainty(*interval), self.drifts(*interval)))
+            last, start = self._steps[i], joined[-1].end
+            noise, unseen = self._uncertainty(start, last.end)
+            joined.append(_Step(last.end, last.pose, last.measured, noise, unseen, self.drifts(start, last.end)))
         self._steps[: i + 1] = joined
 
     def _inside(self, start: int, end: int) -> Iterator[tuple[_Step, float]]:

@@ -68,6 +68,8 @@ class Experiment:
         degrees_of_freedom: of each metric that is a normalised squared error of independent repetitions.
         document: settings -> mean and deviation in the document, of condition and metric; a deviation of None: it
             states none.
+        left_out: settings, condition -> share of one recording that each of its repetitions leaves out; 0: they are
+            independent.
         further: more entries of result.json, from the values of each metric in each condition.
         is_shared: whether what the conditions of a repetition share takes longest, so that one process does them all.
     """
@@ -84,6 +86,7 @@ class Experiment:
     figure: Callable[[dict[str, Any], Path], None]
     degrees_of_freedom: Mapping[str, int] = field(default_factory=dict)
     document: Callable[[Any], DocumentNumbers] = lambda settings: {}
+    left_out: Callable[[Any, str], float] = lambda settings, condition: 0.0
     further: Callable[[Mapping[str, Mapping[str, Sequence[float]]]], dict[str, Any]] = lambda values: {}
     is_shared: bool = False
 

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from calibslam_sim.experiments.design import Experiment, ExperimentSettings, Metric
-from calibslam_sim.experiments.statistics import nees_interval, paired, summary
+from calibslam_sim.experiments.statistics import defined, nees_interval, paired, summary
 
 Values = Mapping[str, Mapping[str, Sequence[float]]]
 
@@ -39,6 +39,12 @@ def result_of(
     """
     first = next(iter(values.values()))
     repetitions = len(next(iter(first.values())))
+    left_out = {condition: experiment.left_out(settings, condition) for condition in values}
+
+    def number(metric: str) -> int:
+        """Of repetitions in which the metric is defined, in the condition that has fewest."""
+        return min(len(defined(metrics[metric])) for metrics in values.values())
+
     return {
         "experiment": name,
         "title": experiment.title,
@@ -49,13 +55,15 @@ def result_of(
             for condition, metrics in values.items()
         },
         "paired": {
-            f"{a}_vs_{b}": {metric: paired(values[a][metric], values[b][metric]) for metric in values[a]}
+            f"{a}_vs_{b}": {metric: paired(values[a][metric], values[b][metric], left_out[a]) for metric in values[a]}
             for a, b in experiment.comparisons(settings)
         },
         "nees_interval": {
-            metric: list(nees_interval(freedom, repetitions))
+            metric: list(nees_interval(freedom, number(metric)))
             for metric, freedom in experiment.degrees_of_freedom.items()
+            if number(metric)
         },
+        "left_out": {condition: share for condition, share in left_out.items() if share},
         **experiment.further(values),
         "code": code,
         "command": command,

@@ -2,6 +2,11 @@
 
 Two conditions see the same worlds and the same unit noise, so the test is on their differences: Student's paired t,
 and beside it Wilcoxon's signed ranks, which a few large differences cannot decide. Both two-sided.
+
+Repetitions that each leave out another share f of one recording have the rest in common: their differences scatter far
+less than those of separate recordings, and a test that took them for independent would find everything significant. The
+mean of all then has (1 - f) / f times the variance of one of them (delete-d jackknife; Shao and Wu 1989), however many
+there are.
 """
 
 from __future__ import annotations
@@ -30,23 +35,33 @@ def summary(values: Sequence[float]) -> dict[str, Any]:
     }
 
 
-def paired(a: Sequence[float], b: Sequence[float]) -> dict[str, float | None]:
+def paired(a: Sequence[float], b: Sequence[float], left_out: float = 0.0) -> dict[str, float | None]:
     """Mean of a - b (negative: a has less error) and the p-values of "no difference".
 
     Repetitions in which one of the two is not defined do not count. None where fewer than two are left; no
     difference anywhere has p = 1, the same one everywhere p = 0.
+
+    Args:
+        a, b: a metric in each repetition.
+        left_out: share of one recording that each leaves out; 0: they are independent. Ranks have no such test.
     """
     differences = defined(np.asarray(a, float) - np.asarray(b, float))
     if len(differences) < 2:
         return {"mean_difference": None, "p_value": None, "wilcoxon_p_value": None}
     if not differences.any():
         return {"mean_difference": 0.0, "p_value": 1.0, "wilcoxon_p_value": 1.0}
-    spread = float(np.ptp(differences))
+    mean, error = float(differences.mean()), standard_error(differences, left_out)
     return {
-        "mean_difference": float(differences.mean()),
-        "p_value": float(stats.ttest_1samp(differences, 0.0).pvalue) if spread else 0.0,
-        "wilcoxon_p_value": float(stats.wilcoxon(differences).pvalue),
+        "mean_difference": mean,
+        "p_value": float(2.0 * stats.t.sf(abs(mean) / error, len(differences) - 1)) if np.ptp(differences) else 0.0,
+        "wilcoxon_p_value": None if left_out else float(stats.wilcoxon(differences).pvalue),
     }
+
+
+def standard_error(values: Array, left_out: float = 0.0) -> float:
+    """Of the mean of at least two values; `left_out` as in `paired`."""
+    share = (1.0 - left_out) / left_out if left_out else 1.0 / len(values)
+    return float(values.std(ddof=1) * np.sqrt(share))
 
 
 def nees_interval(degrees_of_freedom: int, repetitions: int) -> tuple[float, float]:
@@ -59,13 +74,12 @@ def nees_interval(degrees_of_freedom: int, repetitions: int) -> tuple[float, flo
     return float(low / repetitions), float(high / repetitions)
 
 
-def half_interval(values: Sequence[float] | Array) -> float:
-    """Half the width of the 95 % interval (Student's t) of a mean; 0 for a single value."""
+def half_interval(values: Sequence[float] | Array, left_out: float = 0.0) -> float:
+    """Half the width of the 95 % interval (Student's t) of a mean, 0 for a single value; `left_out` as in `paired`."""
     numbers = defined(values)
     if len(numbers) < 2:
         return 0.0
-    error = numbers.std(ddof=1) / np.sqrt(len(numbers))
-    return float(stats.t.ppf(0.5 + CONFIDENCE / 2.0, len(numbers) - 1) * error)
+    return float(stats.t.ppf(0.5 + CONFIDENCE / 2.0, len(numbers) - 1) * standard_error(numbers, left_out))
 
 
 def defined(values: Sequence[float] | Array) -> Array:
