@@ -220,17 +220,16 @@ class Estimator:
         estimated until two images, at least `MapSearch.SIGHTINGS_APART` apart, agree on where it is.
 
         Raises:
-            ValueError: a quadric has no covariance.
+            ValueError: a quadric has no covariance that it could begin with, or its id is there twice; nothing is
+                changed.
         """
-        for quadric in known.quadrics:
-            if not np.isfinite(quadric.covariance).all():
-                raise ValueError(f"quadric {quadric.id} of the map has no covariance")
+        if len({quadric.id for quadric in known.quadrics}) < len(known.quadrics):
+            raise ValueError("two quadrics of the map have the same id")
+        priors = [_prior_of(quadric) for quadric in known.quadrics]
         self.reset()
         if known.quadrics and self.settings.start_in_map == FOUND:
             self._search.search()
-        for quadric in known.quadrics:
-            vector = Ellipsoid(quadric.T_map_object, quadric.radii).vector()
-            covariance = covariance_of_vector(quadric.T_map_object, quadric.radii, quadric.covariance)
+        for quadric, (vector, covariance) in zip(known.quadrics, priors, strict=True):
             classes = Counter({quadric.class_id: max(quadric.observations, 1)})
             self._assignments.know(quadric.id, vector, covariance, classes)
 
@@ -399,3 +398,20 @@ class Estimator:
             between,
             nis,
         )
+
+
+def _prior_of(quadric: QuadricEstimate) -> tuple[Array, Array]:
+    """Vector (9,) and covariance (9, 9) that a known quadric begins with.
+
+    Raises:
+        ValueError: it has none.
+    """
+    if not np.isfinite(quadric.covariance).all():
+        raise ValueError(f"quadric {quadric.id} of the map has no covariance")
+    vector = Ellipsoid(quadric.T_map_object, quadric.radii).vector()
+    covariance = covariance_of_vector(quadric.T_map_object, quadric.radii, quadric.covariance)
+    try:
+        np.linalg.cholesky(covariance)
+    except np.linalg.LinAlgError:
+        raise ValueError(f"the covariance of quadric {quadric.id} of the map is not positive definite") from None
+    return vector, covariance

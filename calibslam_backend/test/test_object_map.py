@@ -82,18 +82,35 @@ DAMAGES = {
     "other format": (set_in("format", "other-map"), 'does not say "format": "calibslam-map"'),
     "no format": (set_in("format", None), 'does not say "format": "calibslam-map"'),
     "future version": (set_in("version", 99), "has version 99, this program reads 1"),
-    "no quadrics": (set_in("quadrics", None), "is damaged: KeyError.*quadrics"),
-    "no camera": (set_in("camera", None), "is damaged: KeyError.*camera"),
-    "no radii": (set_in("quadrics.1.radii", None), "is damaged: KeyError.*radii"),
-    "a radius too few": (set_in("quadrics.1.radii", [1.0, 2.0]), "is damaged"),
-    "a negative radius": (set_in("quadrics.1.radii", [1.0, -2.0, 1.0]), "is damaged.*not positive"),
-    "an infinite position": (set_in("quadrics.0.position", [0.0, 1e999, 0.0]), "is damaged.*not finite"),
-    "a text for a number": (set_in("quadrics.0.position", ["a", 0.0, 0.0]), "is damaged"),
+    "no quadrics": (set_in("quadrics", None), "is damaged: it has no 'quadrics'"),
+    "no camera": (set_in("camera", None), "is damaged: it has no 'camera'"),
+    "no radii": (set_in("quadrics.1.radii", None), r"quadrics\[1\] \(id 8\): it has no 'radii'"),
+    "a radius too few": (set_in("quadrics.1.radii", [1.0, 2.0]), r"\(id 8\): radii does not consist of 3 numbers"),
+    "a negative radius": (set_in("quadrics.1.radii", [1.0, -2.0, 1.0]), "radii .* are not from 1e-06 to 1e.06 m"),
+    "a radius of nothing": (set_in("quadrics.1.radii", [1e-200, 1.0, 1.0]), "radii .* are not from"),
+    "a radius of the sun": (set_in("quadrics.1.radii", [7e8, 7e8, 7e8]), "radii .* are not from"),
+    "an infinite position": (set_in("quadrics.0.position", [0.0, 1e999, 0.0]), "a number of position is not finite"),
+    "a position of garbage": (set_in("quadrics.0.position", [0.0, 1e300, 0.0]), "position .* is farther than 1e.09 m"),
+    "a long number": (set_in("quadrics.0.position", [0.0, 10**400, 0.0]), "position does not consist of 3 numbers"),
+    "a text for a number": (set_in("quadrics.0.position", ["a", 0.0, 0.0]), "position does not consist of 3 numbers"),
     "no unit quaternion": (set_in("keyframes.0.orientation", [1.0, 1.0, 0.0, 0.0]), "is damaged.*no unit quaternion"),
-    "a short covariance": (set_in("keyframes.2.covariance", [0.0] * 35), "is damaged"),
-    "keyframes are no list": (set_in("keyframes", 7), "is damaged"),
-    "a quadric is no object": (set_in("quadrics.0", 7), "is damaged"),
-    "a stamp is missing": (set_in("keyframes.1.stamp", None), "is damaged: KeyError.*stamp"),
+    "a short covariance": (set_in("keyframes.2.covariance", [0.0] * 35), "covariance does not consist of 36 numbers"),
+    "a negative covariance": (set_in("quadrics.1.covariance", (-0.01 * np.eye(9)).ravel().tolist()), "its covariance"),
+    "an asymmetric covariance": (set_in("quadrics.1.covariance.1", 1e3), r"\(id 8\): its covariance is not symmetric"),
+    "a huge covariance": (set_in("quadrics.1.covariance.80", 1e300), "its covariance .* of sensible size"),
+    "a negative variance": (set_in("keyframes.1.covariance.0", -1.0), r"keyframes\[1\]: its covariance is not"),
+    "an asymmetric pose": (set_in("keyframes.1.covariance.1", 1e3), r"keyframes\[1\]: its covariance is not symmetric"),
+    "keyframes are no list": (set_in("keyframes", 7), "keyframes is no list"),
+    "a quadric is no object": (set_in("quadrics.0", 7), r"quadrics\[0\] is no object"),
+    "a stamp is missing": (set_in("keyframes.1.stamp", None), r"keyframes\[1\]: it has no 'stamp'"),
+    "an infinite stamp": (set_in("keyframes.1.stamp", 1e999), "stamp inf is no whole number"),
+    "a stamp that ROS cannot tell": (set_in("keyframes.1.stamp", 2**62), "stamp .* is no whole number from"),
+    "an id twice": (set_in("quadrics.1.id", 7), "quadrics: id 7 is there 2 times"),
+    "a negative id": (set_in("quadrics.0.id", -1), r"quadrics\[0\] \(id -1\): id -1 is no whole number from 0 to"),
+    "an infinite id": (set_in("quadrics.0.id", 1e999), "id inf is no whole number"),
+    "an id that no message holds": (set_in("quadrics.0.id", 2**60), "id 1152921504606846976 is no whole number"),
+    "half an observation": (set_in("quadrics.0.observations", 0.5), "observations 0.5 is no whole number"),
+    "half a character": (set_in("quadrics.0.class_id", "\ud800"), "class_id .* is no text"),
 }
 
 
@@ -108,6 +125,16 @@ def test_damaged_maps(damage: str, tmp_path: Path) -> None:
     with pytest.raises(MapFileError, match=text) as caught:
         ObjectMap.load(path)
     assert str(path) in str(caught.value)
+
+
+def test_a_pose_may_be_known_in_some_directions_only(tmp_path: Path) -> None:
+    """As by odometry that measures no height: what such a run saves can be loaded."""
+    whole = some_map()
+    axes = poses(1)[0, :3, :3]
+    covariance = np.eye(6) * 1e-6
+    covariance[3:, 3:] = (axes * [1e9, 1e-6, 1e-6]) @ axes.T
+    ObjectMap(whole.stamps[:1], whole.poses[:1], covariance[None], ()).save(tmp_path / "map.json")
+    np.testing.assert_array_equal(ObjectMap.load(tmp_path / "map.json").covariances[0], covariance)
 
 
 def test_files_that_are_no_maps(tmp_path: Path) -> None:

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import json
 import pickle
 import weakref
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
+from types import SimpleNamespace
 
 import gtsam
 import numpy as np
@@ -17,7 +19,9 @@ from small_world import CAMERA, SmallWorld, around, objects
 
 from calibslam_backend.estimator import EstimatorSettings
 from calibslam_backend.output.metrics import Trajectory, ate
+from calibslam_backend.output.object_map import ObjectMap
 from calibslam_backend.ros.diagnostics import state
+from calibslam_backend.ros.map_services_node import MapServices
 from calibslam_backend.session.intake import Event, Kind
 from calibslam_backend.session.journal import Journal, Record
 from calibslam_backend.session.session import NotReady, Session
@@ -159,6 +163,61 @@ def test_loaded_maps_and_resets_are_in_the_journal(tmp_path: Path) -> None:
     assert again.estimator is not None
     assert (again.estimator.objects, again.estimator.stamps) == (len(known.quadrics), [])
     assert state(again) == "looking for the camera in the map"
+
+
+def same_id(known: ObjectMap) -> ObjectMap:
+    return replace(known, quadrics=(*known.quadrics, known.quadrics[0]))
+
+
+def no_covariance(known: ObjectMap) -> ObjectMap:
+    return replace(known, quadrics=(replace(known.quadrics[0], covariance=-0.01 * np.eye(9)),))
+
+
+@pytest.mark.parametrize("damage", [same_id, no_covariance])
+def test_a_map_that_cannot_be_used_leaves_the_one_there_is(
+    damage: Callable[[ObjectMap], ObjectMap], tmp_path: Path
+) -> None:
+    session = live(tmp_path / "journal").use(MEASUREMENTS[:60])
+    assert session.estimator is not None
+    before, quadrics, size = session.trajectory(), session.estimator.quadrics(), (tmp_path / "journal").stat().st_size
+    with pytest.raises(ValueError):
+        session.load(damage(session.estimator.object_map()))
+    assert (session.trajectory() == before).all() and len(before) > 5
+    assert [q.id for q in session.estimator.quadrics()] == [q.id for q in quadrics] != []
+    assert (tmp_path / "journal").stat().st_size == size
+
+
+class NoNode:
+    """Takes services, and offers them to nobody."""
+
+    def create_service(self, *_: object) -> None:
+        pass
+
+
+def refused(session: Session, folder: Path) -> str:
+    """The answer of the service `load_map` to a file that it does not load."""
+    services = MapServices(NoNode(), session, folder, "found")  # type: ignore[arg-type]
+    response = services._load(SimpleNamespace(path="map.json"), SimpleNamespace(success=None, message=""))
+    assert response.success is False
+    return str(response.message)
+
+
+def test_the_service_tells_what_is_wrong_with_a_map(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    session = live().use(MEASUREMENTS[:60])
+    assert session.estimator is not None
+    count = session.estimator.objects
+    session.estimator.object_map().save(tmp_path / "map.json")
+    content = json.loads((tmp_path / "map.json").read_text())
+    content["quadrics"] *= 2
+    (tmp_path / "map.json").write_text(json.dumps(content))
+    assert "is there 2 times" in refused(session, tmp_path)
+
+    def no_memory(path: Path) -> ObjectMap:
+        raise MemoryError("too large")
+
+    monkeypatch.setattr(ObjectMap, "load", no_memory)
+    assert refused(session, tmp_path) == "map.json cannot be loaded: MemoryError: too large"
+    assert session.estimator.objects == count and len(session.estimator.stamps) > 5
 
 
 def test_nothing_is_done_while_the_journal_is_read(tmp_path: Path) -> None:

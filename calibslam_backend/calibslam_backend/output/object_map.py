@@ -3,16 +3,26 @@
 from __future__ import annotations
 
 import json
+from collections import Counter
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from calibslam_msgs_py.measurements import Array, QuadricEstimate
+from calibslam_msgs_py.covariance import SYMMETRY_TOLERANCE, is_covariance
+from calibslam_msgs_py.measurements import SECOND, Array, QuadricEstimate
 
 FORMAT, VERSION = "calibslam-map", 1
+LARGEST_ID = 2**31 - 1  # messages have 32 bits, and new objects are numbered on from the largest
+LARGEST_COUNT = 2**32 - 1  # of observations, as messages have it
+LATEST = 2**31 * SECOND  # [ns] that a stamp of ROS can tell
+# What is beyond these is garbage: farther than the moon, and no semi-axis of an object [m].
+LARGEST_POSITION, SMALLEST_RADIUS, LARGEST_RADIUS = 1e9, 1e-6, 1e6
+
+Entry = TypeVar("Entry")
 
 
 class MapFileError(ValueError):
@@ -102,28 +112,29 @@ class ObjectMap:
         if not isinstance(content, dict) or content.get("format") != FORMAT:
             raise MapFileError(f'map {path} does not say "format": "{FORMAT}"; is it a map.json of this project?')
         if content.get("version") != VERSION:
-            raise MapFileError(f"map {path} has version {content.get('version')}, this program reads {VERSION}")
+            raise MapFileError(f"map {path} has version {content.get('version')!r}, this program reads {VERSION}")
         try:
-            keyframes, quadrics = content["keyframes"], content["quadrics"]
-            return cls(
-                tuple(int(k["stamp"]) for k in keyframes),
-                np.reshape([_matrix(k) for k in keyframes], (-1, 4, 4)),
-                np.reshape([_numbers(k["covariance"], (6, 6)) for k in keyframes], (-1, 6, 6)),
-                tuple(
-                    QuadricEstimate(
-                        int(q["id"]),
-                        str(q["class_id"]),
-                        _matrix(q),
-                        _radii(q["radii"]),
-                        _numbers(q["covariance"], (9, 9)),
-                        int(q["observations"]),
-                    )
-                    for q in quadrics
-                ),
-                str(content["camera"]),
-            )
-        except (KeyError, TypeError, ValueError) as error:
-            raise MapFileError(f"map {path} is damaged: {error!r}") from None
+            keyframes = _each(content, "keyframes", _keyframe)
+            quadrics = _each(content, "quadrics", _quadric)
+            camera = _text(content, "camera")
+            ids = Counter(quadric.id for quadric in quadrics)
+            if twice := [j for j, count in ids.items() if count > 1]:
+                raise ValueError(f"quadrics: id {twice[0]} is there {ids[twice[0]]} times")
+        except KeyError as error:
+            raise _damaged(path, f"it has no {error}") from None
+        except ValueError as error:
+            raise _damaged(path, str(error)) from None
+        return cls(
+            tuple(stamp for stamp, _, _ in keyframes),
+            np.reshape([pose for _, pose, _ in keyframes], (-1, 4, 4)),
+            np.reshape([covariance for _, _, covariance in keyframes], (-1, 6, 6)),
+            tuple(quadrics),
+            camera,
+        )
+
+
+def _damaged(path: str, why: str) -> MapFileError:
+    return MapFileError(f"map {path} is damaged: {why}; correct that, or use a map that was saved before")
 
 
 def tum_lines(stamps: tuple[int, ...] | list[int], poses: Array) -> str:
@@ -141,25 +152,93 @@ def _pose(T: Array) -> dict[str, Any]:
     return {"position": T[:3, 3].tolist(), "orientation": orientation.tolist()}
 
 
+def _each(content: dict[str, Any], name: str, read: Callable[[dict[str, Any]], Entry]) -> list[Entry]:
+    """What `read` makes of the entries of a list; ValueError names the entry that it refuses."""
+    if not isinstance(content[name], list):
+        raise ValueError(f"{name} is no list")
+    result = []
+    for n, entry in enumerate(content[name]):
+        if not isinstance(entry, dict):
+            raise ValueError(f"{name}[{n}] is no object of JSON")
+        try:
+            result.append(read(entry))
+        except (KeyError, ValueError) as error:
+            named = f" (id {entry['id']})" if isinstance(entry.get("id"), int) else ""
+            why = f"it has no {error}" if isinstance(error, KeyError) else error
+            raise ValueError(f"{name}[{n}]{named}: {why}") from None
+    return result
+
+
+def _keyframe(entry: dict[str, Any]) -> tuple[int, Array, Array]:
+    """Stamp, pose and covariance.
+
+    Nothing is weighted with this covariance, so it may be as good as singular: where odometry does not measure a
+    direction, it tells that one apart from others that are known well.
+    """
+    covariance = _numbers(entry, "covariance", (6, 6))
+    scale = np.sqrt(np.abs(np.diag(covariance)))
+    asymmetry = np.abs(covariance - covariance.T)
+    if (np.diag(covariance) < 0.0).any() or (asymmetry > SYMMETRY_TOLERANCE * np.outer(scale, scale)).any():
+        raise ValueError("its covariance is not symmetric with variances of 0 or more")
+    return _whole(entry, "stamp", 1 - LATEST, LATEST - 1), _matrix(entry), covariance
+
+
+def _quadric(entry: dict[str, Any]) -> QuadricEstimate:
+    covariance = _numbers(entry, "covariance", (9, 9))
+    if not is_covariance(covariance):
+        raise ValueError("its covariance is not symmetric and positive definite, of sensible size")
+    return QuadricEstimate(
+        _whole(entry, "id", 0, LARGEST_ID),
+        _text(entry, "class_id"),
+        _matrix(entry),
+        _radii(entry),
+        covariance,
+        _whole(entry, "observations", 0, LARGEST_COUNT),
+    )
+
+
 def _matrix(entry: dict[str, Any]) -> Array:
-    orientation = _numbers(entry["orientation"], (4,))
+    orientation = _numbers(entry, "orientation", (4,))
     if abs(np.linalg.norm(orientation) - 1.0) > 1e-6:
         raise ValueError(f"orientation {entry['orientation']} is no unit quaternion")
+    position = _numbers(entry, "position", (3,))
+    if np.abs(position).max() > LARGEST_POSITION:
+        raise ValueError(f"position {entry['position']} is farther than {LARGEST_POSITION:g} m")
     T = np.eye(4)
     T[:3, :3] = Rotation.from_quat(orientation).as_matrix()
-    T[:3, 3] = _numbers(entry["position"], (3,))
+    T[:3, 3] = position
     return T
 
 
-def _radii(values: Any) -> Array:
-    radii = _numbers(values, (3,))
-    if not (radii > 0.0).all():
-        raise ValueError(f"radii {values} are not positive")
+def _radii(entry: dict[str, Any]) -> Array:
+    radii = _numbers(entry, "radii", (3,))
+    if not ((radii >= SMALLEST_RADIUS) & (radii <= LARGEST_RADIUS)).all():
+        raise ValueError(f"radii {entry['radii']} are not from {SMALLEST_RADIUS:g} to {LARGEST_RADIUS:g} m")
     return radii
 
 
-def _numbers(values: Any, shape: tuple[int, ...]) -> Array:
-    numbers = np.asarray(values, dtype=np.float64).reshape(shape)
+def _numbers(entry: dict[str, Any], what: str, shape: tuple[int, ...]) -> Array:
+    values = entry[what]
+    try:
+        numbers = np.asarray(values, dtype=np.float64).reshape(shape)
+    except (TypeError, ValueError, OverflowError):
+        raise ValueError(f"{what} does not consist of {np.prod(shape)} numbers") from None
     if not np.isfinite(numbers).all():
-        raise ValueError("a number is not finite")
+        raise ValueError(f"a number of {what} is not finite")
     return numbers
+
+
+def _whole(entry: dict[str, Any], what: str, low: int, high: int) -> int:
+    value = entry[what]
+    if not isinstance(value, int) or isinstance(value, bool) or not low <= value <= high:
+        raise ValueError(f"{what} {value!r} is no whole number from {low} to {high}")
+    return value
+
+
+def _text(entry: dict[str, Any], what: str) -> str:
+    text = str(entry[what])
+    try:
+        text.encode()
+    except UnicodeEncodeError:  # JSON can hold half of a character, messages cannot
+        raise ValueError(f"{what} {text!r} is no text") from None
+    return text

@@ -11,7 +11,7 @@ from std_srvs.srv import SetBool, Trigger
 
 from calibslam_backend.association.relocalisation import FOUND
 from calibslam_backend.output.map_folder import PathRefused, confined
-from calibslam_backend.output.object_map import MapFileError, ObjectMap
+from calibslam_backend.output.object_map import ObjectMap
 from calibslam_backend.session.session import NotReady, Session
 
 
@@ -66,8 +66,12 @@ class MapServices:
             self._session.check_ready()
             known = ObjectMap.load(confined(request.path, self._folder))
             self._session.load(known)
-        except (NotReady, MapFileError, ValueError) as error:
+        except (NotReady, ValueError) as error:
             response.success, response.message = False, str(error)
+            return response
+        except Exception as error:  # whatever a file may do to those who read it, the node goes on
+            response.success = False
+            response.message = f"{request.path} cannot be loaded: {type(error).__name__}: {error}"
             return response
         start = (
             "the camera is looked for by the objects it sees"

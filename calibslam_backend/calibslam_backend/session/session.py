@@ -271,10 +271,10 @@ class Session:
         self.check_ready()
         with self.lock:
             assert self.estimator is not None
+            loaded = Event(Kind.MAP, known, known.to_json().encode())
             self.estimator.load(known)
             self._guard.reset()
             self.refined = True
-            loaded = Event(Kind.MAP, known, known.to_json().encode())
             try:
                 self.intake.begin_again([self._camera, loaded], keep_queue=True)
             except OSError as error:
