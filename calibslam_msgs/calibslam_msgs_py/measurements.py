@@ -1,8 +1,9 @@
 """What the algorithms of CalibSLAM exchange, as plain data: numpy inside, no ROS.
 
 Conventions: SI units, radians, pixels; time is integer nanoseconds; `T_a_b` maps coordinates of frame b to
-frame a. A 6x6 covariance here is that of GTSAM's Pose3 tangent, [rotation, translation] in the body frame;
-`calibslam_msgs_py.conversions` turns it into the ROS order and back.
+frame a. An image covers 0 to its width and 0 to its height [px]: centres of pixels lie at halves. A 6x6 covariance
+here is that of GTSAM's Pose3 tangent, [rotation, translation] in the body frame; `calibslam_msgs_py.conversions` turns
+it into the ROS order and back.
 """
 
 from __future__ import annotations
