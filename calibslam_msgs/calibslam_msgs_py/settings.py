@@ -5,7 +5,7 @@
         sigma: float = setting(5.0, "standard deviation of an edge", unit="px", low=0.1)
 
 A default, its unit and its bounds stand there and nowhere else. A value outside its bounds is refused, never
-corrected.
+corrected; so is an infinite one.
 """
 
 from __future__ import annotations
@@ -196,8 +196,9 @@ def _checked(field: dataclasses.Field[Any], kind: type, value: Any) -> Any:
     value = kind(value)
     low, high, choices = field.metadata["low"], field.metadata["high"], field.metadata["choices"]
     outside = (low is not None and value < low) or (high is not None and value > high)
-    if outside or (choices and value not in choices) or (kind is float and math.isnan(value)):
-        valid = valid_values(field) or expected
+    finite = kind is not float or math.isfinite(value)
+    if outside or (choices and value not in choices) or not finite:
+        valid = (valid_values(field) or expected) + ("" if finite else " and finite")
         raise SettingsError(f"{field.name} = {value!r}: must be {valid} ({describe(field)})")
     return value
 

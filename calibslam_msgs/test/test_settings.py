@@ -24,6 +24,7 @@ from calibslam_msgs_py.settings import (
 class Example(Settings):
     sigma: float = setting(5.0, "standard deviation of an edge", unit="px", low=0.1)
     share: float = setting(0.05, "share of outliers, below 100 %", low=0.0, high=1.0)
+    offset: float = setting(0.0, "added to each edge", unit="px")
     skip: int = setting(10, "updates between relinearisations", low=1)
     robust: bool = setting(True, "whether the loss is robust")
     model: str = setting("calibrated", "noise model", choices=("calibrated", "fixed"))
@@ -33,6 +34,8 @@ class Example(Settings):
 BAD = [
     ("sigma", 0.0, "sigma = 0.0: must be at least 0.1"),
     ("sigma", float("nan"), "sigma = nan"),
+    ("sigma", float("inf"), "sigma = inf: must be at least 0.1 and finite"),
+    ("offset", -float("inf"), "offset = -inf: must be a number and finite"),
     ("sigma", "5", "must be a number"),
     ("sigma", True, "must be a number"),
     ("share", 1.5, "must be 0.0 to 1.0"),
@@ -79,6 +82,7 @@ def test_command_line() -> None:
 def test_bad_command_lines_say_why(capsys: pytest.CaptureFixture[str]) -> None:
     for arguments, text in (
         (("--sigma", "0"), "sigma = 0.0: must be at least 0.1 (standard deviation of an edge [px]"),
+        (("--sigma", "inf"), "sigma = inf: must be at least 0.1 and finite"),
         (("--sigma", "wide"), "invalid float value: 'wide'"),
         (("--skip", "1.5"), "invalid int value"),
         (("--model", "best"), "invalid choice: 'best'"),
@@ -123,7 +127,9 @@ def test_ros_parameters(context: rclpy.Context) -> None:
     refuse_unknown_parameters(node)
 
 
-@pytest.mark.parametrize("parameter", ["sigma:=0.0", "skip:=1.5", "robust:=1", "model:=best", "frame:=3"])
+@pytest.mark.parametrize(
+    "parameter", ["sigma:=0.0", "offset:=.inf", "skip:=1.5", "robust:=1", "model:=best", "frame:=3"]
+)
 def test_bad_ros_parameters_are_refused(context: rclpy.Context, parameter: str) -> None:
     with pytest.raises(SettingsError, match=parameter.split(":")[0]):
         declare_parameters(node_with(context, parameter), Example)
