@@ -141,5 +141,7 @@ def test_bags_without_images_and_the_bag_itself_are_refused(
     assert simulate.main(["--out", str(tmp_path / "bag"), "--duration", "0.1"]) == 0
     assert detect_bag.main([str(tmp_path / "bag"), "--out", str(tmp_path / "out")]) == 1
     assert "has no images; a simulated recording has them with `simulate --images`" in capsys.readouterr().err
-    assert detect_bag.main([str(recording[0]), "--out", str(recording[0]), "--overwrite"]) == 1
-    assert "another bag" in capsys.readouterr().err and recording[0].exists()
+    for read in (recording[0], recording[0] / "bag.mcap"):
+        assert detect_bag.main([str(read), "--out", str(recording[0]), "--overwrite"]) == 1
+        assert "choose another path" in capsys.readouterr().err
+    assert (recording[0] / "bag.mcap").exists()

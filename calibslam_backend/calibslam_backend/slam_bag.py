@@ -20,7 +20,7 @@ from calibslam_backend.output.published import POSE, TRANSFORM, camera_transform
 from calibslam_backend.output.run_folder import RunRecord, write_run
 from calibslam_backend.recording import Recording
 from calibslam_msgs_py import bags
-from calibslam_msgs_py.bags import BagError, BagReader, BagWriter
+from calibslam_msgs_py.bags import BagError, BagReader, BagWriter, refuse_to_replace
 from calibslam_msgs_py.command import command
 from calibslam_msgs_py.measurements import SECOND, Boxes, InvalidMeasurement
 from calibslam_msgs_py.settings import SettingsError, add_arguments, from_arguments
@@ -78,6 +78,7 @@ def slam_bag(
     known: Path | None = None,
 ) -> dict[str, object]:
     """Run the estimator over a bag and write a RUN folder; returns its metrics."""
+    refuse_to_replace(out / "run.mcap", bag)
     recording = Recording.open(bag, calibrator)
     estimator = Estimator(recording.camera, transform_from_text(camera_in_body), settings)
     if known is not None:

@@ -230,6 +230,20 @@ def test_what_is_no_bag(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> N
     assert "is not a rosbag2 folder" in fails(tmp_path / "folder", tmp_path / "run", capsys)
 
 
+@pytest.mark.parametrize("linked", [False, True])
+def test_the_recording_is_not_replaced_by_the_result(
+    linked: bool, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    bag = write(tmp_path / "desk" / "run.mcap", messages())
+    before = bag.read_bytes()
+    out = tmp_path / "link" if linked else bag.parent
+    if linked:
+        out.symlink_to(bag.parent)
+    for path in (bag, bag.parent):
+        assert "run.mcap would replace" in fails(path, out, capsys)
+    assert bag.read_bytes() == before and list(bag.parent.iterdir()) == [bag]
+
+
 def test_an_unknown_message_type_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """On a topic that is needed it is an error, elsewhere it does not matter."""
     path = tmp_path / "bag"

@@ -23,7 +23,7 @@ from calibslam_detector.images.overlay import draw_overlay
 from calibslam_detector.model.detector import Detector, DetectorSettings, DeviceError
 from calibslam_detector.model.weights_file import SHIPPED, WeightsError
 from calibslam_msgs_py import bags
-from calibslam_msgs_py.bags import BagError, BagReader, BagWriter
+from calibslam_msgs_py.bags import BagError, BagReader, BagWriter, refuse_to_replace
 from calibslam_msgs_py.command import command
 from calibslam_msgs_py.conversions import boxes_to_msg, header_to_msg, stamp_from_msg, valid_boxes
 from calibslam_msgs_py.measurements import Boxes, InvalidMeasurement
@@ -68,8 +68,9 @@ def detect_bag(bag: Path, out: Path, detector: Detector, settings: DetectBagSett
     """Write `out`: `bag` with the boxes that the detector finds, at the log times of the images.
 
     Raises:
-        BagError: the bag cannot be read, has no such images, or `out` exists.
+        BagError: the bag cannot be read, has no such images, or `out` exists or would replace it.
     """
+    refuse_to_replace(out, bag)
     images, found, strange = 0, 0, 0
     left_out: Counter[str] = Counter()
     # One reader for what is copied as it is and one for the images: each has its own place in the file.
@@ -169,8 +170,6 @@ def main(argv: Sequence[str] | None = None) -> int:
     add_arguments(parser, DetectorSettings)
     arguments = parser.parse_args(argv)
     try:
-        if arguments.out.absolute() == arguments.bag.absolute():
-            raise BagError("--out must be another bag than the one that is read")
         settings = from_arguments(arguments, DetectBagSettings)
         detector = Detector.from_file(arguments.weights, from_arguments(arguments, DetectorSettings))
         done = detect_bag(arguments.bag, arguments.out, detector, settings, arguments.overwrite)

@@ -23,7 +23,7 @@ from calibslam_detector.foreign_boxes.calibrator import FILE_VERSION, Calibrator
 from calibslam_detector.foreign_boxes.edge_mixture import EdgeMixture, fit_mixture
 from calibslam_detector.foreign_boxes.features import FEATURES, edge_features
 from calibslam_detector.foreign_boxes.log_linear import LogLinearCalibrator
-from calibslam_msgs_py.bags import BagError
+from calibslam_msgs_py.bags import BagError, refuse_to_replace
 from calibslam_msgs_py.command import command
 from calibslam_msgs_py.measurements import Array, Boxes
 
@@ -198,6 +198,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--test", metavar="BAG", help="another recording, to judge the result on")
     parsed = parser.parse_args(arguments)
     try:
+        refuse_to_replace(parsed.out, parsed.bag, *([parsed.test] if parsed.test else []))
         edges = Edges.of(references(parsed.bag))
         model, constant = fit(edges)
         result = calibrator(model, edges.extents)

@@ -177,3 +177,12 @@ def test_a_recording_without_what_is_needed(
     error = capsys.readouterr().err
     assert error.startswith("error: ") and says in error
     assert not (tmp_path / "c.json").exists()
+
+
+def test_a_recording_is_not_replaced_by_the_calibrator(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    bag, test = (write(tmp_path / name, messages()) for name in ("fit.mcap", "test.mcap"))
+    before = bag.read_bytes(), test.read_bytes()
+    for out in (bag, test):
+        assert main([str(bag), "--out", str(out), "--test", str(test)]) == 1
+        assert "would replace" in capsys.readouterr().err
+    assert (bag.read_bytes(), test.read_bytes()) == before

@@ -6,6 +6,7 @@ compressed with zstd. The same input gives the same bytes (rosbags writes no tim
 
 from __future__ import annotations
 
+import os
 import shutil
 from collections import Counter
 from collections.abc import Collection, Iterator
@@ -22,7 +23,7 @@ from rosbags.typesys.store import Typestore
 
 from calibslam_msgs_py.bag_types import BagError, BagTypes, calibslam_typestore, new_typestore
 
-__all__ = ["BagError", "BagReader", "BagWriter", "types"]
+__all__ = ["BagError", "BagReader", "BagWriter", "refuse_to_replace", "types"]
 
 # The message classes of bags, for `conversions`.
 types = BagTypes()
@@ -259,6 +260,25 @@ class BagWriter:
             self._connections[topic] = self._writer.add_connection(topic, kind, typestore=self._store)
         elif connection.msgtype != kind:
             raise BagError(f"topic {topic} has type {connection.msgtype}, not {kind}")
+
+
+def refuse_to_replace(out: Path, *read: str | Path) -> None:
+    """Refuse to write where something is read from; call it before anything is written.
+
+    Args:
+        out: bag or other file to write.
+        read: bags, each a folder or a file.
+
+    Raises:
+        BagError: `out` is such a bag, a file in it, or the folder that it lies in, whatever links lead there.
+    """
+    if not out.exists():
+        return
+    for bag in map(Path, read):
+        for part in [bag, *(bag.iterdir() if bag.is_dir() else ())]:
+            lost = [part, *part.absolute().parents, *Path(os.path.realpath(part)).parents]
+            if any(place.exists() and place.samefile(out) for place in lost):
+                raise BagError(f"{out} would replace {part}, which is read: choose another path for the result")
 
 
 def _remove_bag(path: Path) -> None:

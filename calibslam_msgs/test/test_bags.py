@@ -9,7 +9,7 @@ from mcap_ros2.decoder import DecoderFactory
 
 from calibslam_msgs_py import bags
 from calibslam_msgs_py import conversions as c
-from calibslam_msgs_py.bags import BagError, BagReader, BagWriter
+from calibslam_msgs_py.bags import BagError, BagReader, BagWriter, refuse_to_replace
 from calibslam_msgs_py.measurements import Boxes, RelativeMotion
 
 SECOND = 1_000_000_000
@@ -185,6 +185,40 @@ def test_only_bags_are_overwritten(tmp_path: Path) -> None:
     with pytest.raises(BagError, match=r"chapter\.tex"):
         BagWriter(folder, overwrite=True)
     assert (folder / "chapter.tex").exists()
+
+
+@pytest.mark.parametrize(
+    ("read", "out"),
+    [
+        ("bag", "bag"),
+        ("bag", "bag/bag.mcap"),
+        ("bag", "bag/metadata.yaml"),
+        ("bag", "bag/../bag"),
+        ("bag/bag.mcap", "bag/bag.mcap"),
+        ("bag/bag.mcap", "bag"),  # with --overwrite the whole folder goes
+        ("bag", "link"),
+        ("link", "bag"),
+        ("link", "link/bag.mcap"),
+        ("bag", "file.mcap"),
+        ("file.mcap", "bag"),
+        ("file.mcap", "file.mcap"),
+    ],
+)
+def test_what_is_read_is_not_replaced(read: str, out: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write(tmp_path / "bag")
+    (tmp_path / "link").symlink_to("bag")
+    (tmp_path / "file.mcap").symlink_to("bag/bag.mcap")
+    monkeypatch.chdir(tmp_path)
+    for first in (Path(read), tmp_path / read):
+        for second in (Path(out), tmp_path / out):
+            with pytest.raises(BagError, match=r"would replace .* which is read"):
+                refuse_to_replace(second, tmp_path / "nowhere", first)
+
+
+@pytest.mark.parametrize("out", ["other", "bag/other.mcap", "bag/run", "copy"])
+def test_beside_what_is_read_there_is_room(out: str, tmp_path: Path) -> None:
+    write(tmp_path / "copy")
+    refuse_to_replace(tmp_path / out, write(tmp_path / "bag"), tmp_path / "bag" / "bag.mcap")
 
 
 @pytest.mark.parametrize("name", ["bag", "run.mcap"])

@@ -20,7 +20,7 @@ import numpy as np
 from calibslam_backend.output.metrics import NoGroundTruth, Trajectory, ate
 from calibslam_backend.recording import MOTIONS
 from calibslam_msgs_py import bags
-from calibslam_msgs_py.bags import BagError, BagReader, BagWriter
+from calibslam_msgs_py.bags import BagError, BagReader, BagWriter, refuse_to_replace
 from calibslam_msgs_py.command import command
 from calibslam_msgs_py.conversions import camera_from_msg, motion_to_msg, stamped_pose_from_msg
 from calibslam_msgs_py.measurements import Camera, InvalidMeasurement, RelativeMotion
@@ -186,6 +186,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     add_arguments(parser, VisualOdometrySettings)
     parsed = parser.parse_args(argv)
     try:
+        refuse_to_replace(parsed.out, parsed.bag)
         camera = DepthCamera(
             from_arguments(parsed, DepthCameraSettings), from_arguments(parsed, VisualOdometrySettings)
         )

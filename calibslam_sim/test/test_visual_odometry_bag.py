@@ -94,6 +94,14 @@ def test_what_is_missing_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[
     assert not (tmp_path / "out").exists()
 
 
+def test_the_recording_is_not_replaced(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    bag = make(tmp_path / "bag", images=3)
+    for read in (bag, bag / "bag.mcap"):
+        assert run(read, bag, "--overwrite") == 1
+        assert "would replace" in capsys.readouterr().err
+    assert sorted(path.name for path in bag.iterdir()) == ["bag.mcap", "metadata.yaml"]
+
+
 def test_depth_of_another_frame_is_refused_unless_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     bag = make(tmp_path / "bag", depth_frame="infrared", images=4)
     assert run(bag, tmp_path / "out") == 1
