@@ -166,7 +166,7 @@ def test_reliability_plot(tmp_path: Path, rng: np.random.Generator) -> None:
     z = rng.standard_normal((2000, 1))
     curves = {"calibrated": reliability(z), "overconfident": reliability(1.5 * z), "sums": reliability(z, K=50)}
     assert curves["calibrated"].is_calibrated and not curves["overconfident"].is_calibrated
-    plot(curves, tmp_path / "reliability.png", "three predictors")
+    plot(curves, tmp_path / "reliability.png", "three predictors, called x$^$ by somebody")
     assert (tmp_path / "reliability.png").stat().st_size > 5000
 
 

@@ -15,8 +15,9 @@ from scipy import stats
 
 from calibslam_sim import experiment
 from calibslam_sim.experiments import fingerprint, kalman
-from calibslam_sim.experiments.design import ExperimentError, repetition_seed, scale_name
+from calibslam_sim.experiments.design import ExperimentError, Metric, repetition_seed, scale_name
 from calibslam_sim.experiments.engine import run
+from calibslam_sim.experiments.figures import condition_figure
 from calibslam_sim.experiments.kalman import KalmanSettings
 from calibslam_sim.experiments.outputs import mean_and_deviation, p_value
 from calibslam_sim.experiments.run_store import REPETITIONS, SETTINGS, Repetition, RunStore
@@ -34,6 +35,14 @@ def call(out: Path, *options: str) -> dict[str, Any]:
 
 def numbers(result: dict[str, Any]) -> tuple[Any, ...]:
     return result["conditions"], result["paired"], result["filter_graph_max_difference"]
+
+
+def test_conditions_may_have_any_name(tmp_path: Path) -> None:
+    """Those of `image` are named by who calls it."""
+    names = ("x$^$", "nll")
+    result = {"repetitions": 3, "conditions": {name: {"ate_m": summary([0.1, 0.2, 0.3])} for name in names}}
+    condition_figure(tmp_path / "figure.png", "$^$", result, {"ate_m": Metric("ATE", "m")}, names)
+    assert (tmp_path / "figure.png").stat().st_size > 5000
 
 
 # -- statistics by hand -----------------------------------------------------------------------------------------------

@@ -20,6 +20,7 @@ MARGIN = 1.5  # [m] around the trajectories
 CONFIDENCE = 2.0  # standard deviations that ellipses and bands show
 
 
+@matplotlib.rc_context({"text.parse_math": False})  # names are texts, whatever signs they hold
 def plot_run(path: Path, title: str, result: ObjectMap, odometry: Array, truth: Trajectory | None) -> None:
     """Trajectories and objects from above, and with ground truth the position error over time.
 
@@ -30,6 +31,7 @@ def plot_run(path: Path, title: str, result: ObjectMap, odometry: Array, truth: 
         odometry: (N, 4, 4) the same keyframes by odometry alone.
         truth: in any frame; None: not known.
     """
+    title = title.encode(errors="replace").decode()  # names of files may hold bytes that are no characters
     figure, axes = plt.subplots(
         1, 2 if truth is not None else 1, figsize=(14 if truth is not None else 8, 7), squeeze=False, dpi=110
     )

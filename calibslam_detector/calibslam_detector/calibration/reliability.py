@@ -50,6 +50,7 @@ def reliability(z: Array, K: int | None = None, confidence: float = 0.95, levels
     return Reliability(levels, observed, float(np.sqrt(np.log(2.0 / (1.0 - confidence)) / (2.0 * n))))
 
 
+@matplotlib.rc_context({"text.parse_math": False})  # names are texts, whatever signs they hold
 def plot(curves: Mapping[str, Reliability], path: Path, title: str) -> None:
     """Draw curves into a PNG; they differ in markers and line styles, so it can be read without colour."""
     figure, axes = plt.subplots(figsize=(5.2, 5.0), dpi=110)

@@ -90,6 +90,7 @@ def _curve(panel: Axes, result: dict[str, Any], metric: str, curve: Curve, style
         panel.axhline(level, color=colour, linestyle=style[1:], linewidth=1.0, label=curve.level_title)
 
 
+@matplotlib.rc_context({"text.parse_math": False})  # names are texts, whatever signs they hold
 def condition_figure(
     path: Path, title: str, result: dict[str, Any], metrics: Mapping[str, Metric], conditions: Sequence[str]
 ) -> None:
