@@ -29,7 +29,7 @@ from calibslam_backend.session.journal import Journal, JournalError
 from calibslam_backend.session.session import NotReady, Session
 from calibslam_backend.session.settings import SessionSettings
 from calibslam_msgs_py.conversions import RosTypes
-from calibslam_msgs_py.measurements import Boxes, InvalidMeasurement, RelativeMotion
+from calibslam_msgs_py.measurements import Boxes, InvalidMeasurement, RelativeMotion, StampedPose
 from calibslam_msgs_py.node import (
     LATCHED,
     MEASUREMENT_INPUT,
@@ -52,6 +52,12 @@ class NodeSettings(SessionSettings):
 
     camera_in_body: str = setting("0 0 0 0 0 0 1", "camera's optical frame in odometry's body: x y z qx qy qz qw")
     map_frame: str = setting("map", "name of the frame that poses and quadrics are published in")
+    transform_tolerance: float = setting(
+        0.1,
+        "how far ahead of odometry map -> odom is dated on /tf, to be found by who looks up the present",
+        unit="s",
+        low=0.0,
+    )
     map_period: float = setting(1.0, "least wall time between two messages of the map", unit="s", low=0.0)
     map_folder: str = setting(".", "folder that the maps of services lie in; paths that lead out of it are refused")
     save_at_exit: str = setting("", "file in map_folder to write the map to at SIGINT or SIGTERM; empty: none")
@@ -78,7 +84,7 @@ class BackendNode(Node):
         self._counters = Counters(self, lambda: of_session(self._session))
         self._outputs = {topic: advertise(self, self._types(kind), topic, LATCHED) for topic, kind in TOPICS.items()}
         self._map = MapPublisher(self._outputs, self._types, settings.map_frame, settings.map_period)
-        self._map_to_odom = MapToOdom(self, settings.map_frame)
+        self._map_to_odom = MapToOdom(self, settings.map_frame, settings.transform_tolerance, self)
         load_kernels()  # before anything can come in and wait
         self._session = Session(T_body_camera, settings, estimator_settings, self, journal)
         self._decoder = Decoder(settings.map_frame, self)
@@ -175,11 +181,14 @@ class BackendNode(Node):
         session = self._session
         with session.lock:
             estimator = session.estimator
-            if estimator is None or not estimator.stamps or not session.pose_is_new:
+            if estimator is None or not estimator.stamps:
+                self._map_to_odom.pose = None  # until the camera is found in the map
+                return
+            if not session.pose_is_new:
                 return
             session.pose_is_new = False
             self._outputs[POSE].publish(pose_message(estimator, self._types, self._settings.map_frame))
-            self._map_to_odom.publish(estimator.stamps[-1], estimator.body_pose())
+            self._map_to_odom.pose = StampedPose(estimator.stamps[-1], estimator.body_pose())
 
     def close(self) -> None:
         """Let the worker end its update, save the map if that is wanted, and have the journal on disk."""

@@ -1,13 +1,24 @@
-"""The transform map -> odom, where the installation has tf2_msgs (the Python wheels of ROS have not)."""
+"""The transform map -> odom, where the installation has tf2_msgs (the Python wheels of ROS have not).
+
+tf2 does not extrapolate: between two keyframes, look-ups of the present would fail. So the last transform is published
+again with each odometry message, dated a little ahead, as nodes that localise do (REP 105; AMCL's transform_tolerance).
+"""
 
 from __future__ import annotations
 
 from bisect import bisect_left
+from dataclasses import replace
 from typing import Any
 
+import gtsam
 import numpy as np
 
-from calibslam_msgs_py.measurements import Array
+from calibslam_backend.session.intake import Report
+from calibslam_backend.session.time_guard import TimeGuard
+from calibslam_msgs_py.conversions import RosTypes, odometry_from_msg
+from calibslam_msgs_py.geometry_conversions import transform_to_msg
+from calibslam_msgs_py.measurements import SECOND, Array, InvalidMeasurement, StampedPose
+from calibslam_msgs_py.node import MEASUREMENT_INPUT
 
 
 def map_to_odom(T_map_body: Array, T_odom_body: Array) -> Array:
@@ -16,40 +27,72 @@ def map_to_odom(T_map_body: Array, T_odom_body: Array) -> Array:
 
 
 class OdometryHistory:
-    """The last poses of an odometry topic, to be looked up by time."""
+    """The last poses of an odometry topic, to be looked up by time; for one thread."""
 
-    LENGTH = 2000
+    KEPT = 30 * SECOND  # images wait for their detector and their turn; at 1 kHz these are 8 MB
+    LARGEST_STEP = SECOND // 2  # at 1 m/s² a body is at most 0.03 m from the geodesic between two poses
 
     def __init__(self) -> None:
         self._stamps: list[int] = []
         self._poses: list[Array] = []
 
-    def add(self, stamp: int, T_odom_body: Array) -> None:
-        """A newer pose; if time went back, the ones before are forgotten."""
-        if self._stamps and stamp <= self._stamps[-1]:
+    @property
+    def end(self) -> int | None:
+        """Time of the newest pose [ns]."""
+        return self._stamps[-1] if self._stamps else None
+
+    def add(self, stamp: int, T_odom_body: Array) -> bool:
+        """A newer pose; whether it goes on from the one before, without a gap.
+
+        One that comes twice, or a little late, is left out. If time went back, the poses before are forgotten.
+        """
+        end = self.end
+        if end is not None and stamp <= end:
+            if stamp > end - TimeGuard.LATE:
+                return False
             self._stamps.clear()
             self._poses.clear()
         self._stamps.append(stamp)
         self._poses.append(T_odom_body)
-        if len(self._stamps) > self.LENGTH:
-            del self._stamps[: self.LENGTH // 2], self._poses[: self.LENGTH // 2]
+        old = bisect_left(self._stamps, stamp - self.KEPT)
+        del self._stamps[:old], self._poses[:old]
+        return end is not None and end < stamp <= end + self.LARGEST_STEP
 
-    def nearest(self, stamp: int) -> Array | None:
-        """The pose nearest in time; None if there is none."""
-        if not self._stamps:
-            return None
+    def at(self, stamp: int) -> Array | None:
+        """(4, 4) T_odom_body at a time [ns], interpolated along the geodesic; None outside what is kept and in gaps."""
         i = bisect_left(self._stamps, stamp)
-        candidates = [n for n in (i - 1, i) if 0 <= n < len(self._stamps)]
-        return self._poses[min(candidates, key=lambda n: abs(self._stamps[n] - stamp))]
+        if i == len(self._stamps):
+            return None
+        end = self._stamps[i]
+        if stamp == end:
+            return self._poses[i]
+        if i == 0 or end - self._stamps[i - 1] > self.LARGEST_STEP:
+            return None
+        start, before, after = self._stamps[i - 1], gtsam.Pose3(self._poses[i - 1]), gtsam.Pose3(self._poses[i])
+        step = gtsam.Pose3.Logmap(before.between(after))
+        return np.asarray(before.compose(gtsam.Pose3.Expmap((stamp - start) / (end - start) * step)).matrix())
 
 
 class MapToOdom:
-    """Publishes /tf; does nothing where tf2_msgs is not installed."""
+    """Publishes /tf with each odometry message; does nothing where tf2_msgs is not installed.
 
-    def __init__(self, node: Any, map_frame: str) -> None:
+    Args:
+        node: that publishes and subscribes; all but `pose` belongs to the thread that calls it back.
+        map_frame: name of the map's frame.
+        tolerance: how far ahead [s] of odometry the transform is dated.
+        report: who is told of poses without odometry.
+
+    Attributes:
+        pose: newest of the body in the map, from any thread; None: not known, and nothing is published.
+    """
+
+    def __init__(self, node: Any, map_frame: str, tolerance: float, report: Report) -> None:
+        self.pose: StampedPose | None = None
+        self._used: StampedPose | None = None  # the last one that was compared with odometry
+        self._T_map_odom: StampedPose | None = None  # what came of it
         self._history = OdometryHistory()
         self._map_frame, self._odom_frame = map_frame, "odom"
-        self._publisher = None
+        self._tolerance, self._report, self._types = int(tolerance * SECOND), report, RosTypes()
         try:
             from tf2_msgs.msg import TFMessage
         except ImportError:
@@ -57,38 +100,33 @@ class MapToOdom:
             return
         from nav_msgs.msg import Odometry
 
-        from calibslam_msgs_py.node import MEASUREMENT_INPUT
-
         self._publisher = node.create_publisher(TFMessage, "/tf", 100)
         node.create_subscription(Odometry, "odom", self._receive, MEASUREMENT_INPUT)
 
     def _receive(self, message: Any) -> None:
-        from calibslam_msgs_py.conversions import odometry_from_msg
-        from calibslam_msgs_py.measurements import InvalidMeasurement
-
         try:
-            pose, _ = odometry_from_msg(message)
+            odometry, _ = odometry_from_msg(message)
         except InvalidMeasurement:
             return  # the odometry node counts and reports it
+        goes_on = self._history.add(odometry.stamp, odometry.T)
         self._odom_frame = message.header.frame_id or self._odom_frame
-        self._history.add(pose.stamp, pose.T)
+        self._compare()
+        # tf2 warns of stamps that come twice, and a single one far ahead would have it forget all before.
+        if goes_on and self._T_map_odom is not None:
+            dated = replace(self._T_map_odom, stamp=odometry.stamp + self._tolerance)
+            self._publisher.publish(transform_to_msg(dated, self._map_frame, self._odom_frame, self._types))
 
-    def publish(self, stamp: int, T_map_body: Array) -> None:
-        """The transform that puts the body where the map says, at a time [ns]."""
-        T_odom_body = self._history.nearest(stamp)
-        if self._publisher is None or T_odom_body is None:
+    def _compare(self) -> None:
+        """Use the pose in the map, if it is a new one and odometry has come so far."""
+        pose, now = self.pose, self._history.end
+        assert now is not None
+        if pose is None or (self._T_map_odom is not None and self._T_map_odom.stamp > now):  # time went back
+            self._T_map_odom = None
+        if pose is None or pose is self._used or pose.stamp > now:
             return
-        from geometry_msgs.msg import Transform, TransformStamped
-        from tf2_msgs.msg import TFMessage
-
-        from calibslam_msgs_py.conversions import RosTypes, header_to_msg, pose_to_msg
-
-        pose = pose_to_msg(map_to_odom(T_map_body, T_odom_body), RosTypes())
-        transform = TransformStamped(
-            header=header_to_msg(stamp, self._map_frame, RosTypes()), child_frame_id=self._odom_frame
-        )
-        transform.transform = Transform(rotation=pose.orientation)
-        transform.transform.translation.x = pose.position.x
-        transform.transform.translation.y = pose.position.y
-        transform.transform.translation.z = pose.position.z
-        self._publisher.publish(TFMessage(transforms=[transform]))
+        self._used = pose
+        T_odom_body = self._history.at(pose.stamp)
+        if T_odom_body is None:
+            self._report.reject(InvalidMeasurement("odom_gap", f"map -> odom: no odometry around {pose.stamp} ns"))
+            return
+        self._T_map_odom = StampedPose(pose.stamp, map_to_odom(pose.T, T_odom_body))
