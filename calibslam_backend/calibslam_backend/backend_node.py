@@ -33,7 +33,6 @@ from calibslam_msgs_py.measurements import Boxes, InvalidMeasurement, RelativeMo
 from calibslam_msgs_py.node import (
     LATCHED,
     MEASUREMENT_INPUT,
-    SECONDS_BETWEEN_WARNINGS,
     SENSOR,
     Counters,
     advertise,
@@ -128,7 +127,7 @@ class BackendNode(Node):
 
     def say(self, text: str) -> None:
         """Something a person should see."""
-        self.get_logger().warning(text, throttle_duration_sec=SECONDS_BETWEEN_WARNINGS)
+        self._counters.warn(text)
 
     # -- executor's thread --------------------------------------------------------------------------------------
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import signal
 import sys
 import threading
@@ -57,7 +58,7 @@ QOS_OVERRIDES = QoSOverridingOptions(
 )
 
 BAD_SETTINGS = 2  # exit code
-SECONDS_BETWEEN_WARNINGS = 5.0
+SECONDS_BETWEEN_WARNINGS = 5.0  # of one kind
 SIGNAL_LATENCY = 0.1  # how long a waiting executor may not see a signal [s]
 
 
@@ -150,6 +151,7 @@ class Counters:
     def __init__(self, node: Node, describe: Callable[[], Mapping[str, object]] | None = None) -> None:
         self._node, self._describe = node, describe
         self._counting = threading.Lock()  # several threads may count
+        self._throttle = _Throttle()
         self._counts: Counter[str] = Counter()
         self._values: dict[str, str] = {}
         self._published: Counter[str] = Counter()
@@ -166,7 +168,12 @@ class Counters:
     def reject(self, error: InvalidMeasurement, count: int = 1) -> None:
         """Count what is left out by its reason, and say so now and then."""
         self.count(f"rejected_{error.reason}", count)
-        self._node.get_logger().warning(f"left out: {error}", throttle_duration_sec=SECONDS_BETWEEN_WARNINGS)
+        self.warn(f"left out: {error}", error.reason)
+
+    def warn(self, text: str, kind: str = "") -> None:
+        """Say something, if nothing of its kind was said just now; by default, texts that differ in numbers only are one."""
+        if self._throttle.lets_through(kind or re.sub(r"\d+", "#", text)):
+            self._node.get_logger().warning(text)
 
     def arrived(self, name: str, stamp: int) -> None:
         """A message of an input came; stamp [ns]. Its rate, age and delay are then stated."""
@@ -203,6 +210,25 @@ class Counters:
         array = DiagnosticArray(status=[status])
         array.header.stamp = self._node.get_clock().now().to_msg()
         self._publisher.publish(array)
+
+
+class _Throttle:
+    """What kinds of warnings were said just now. rclpy's has one time for each line of code, whatever it says."""
+
+    MOST = 100  # kinds in SECONDS_BETWEEN_WARNINGS; exceptions of others may say anything
+
+    def __init__(self) -> None:
+        self._asked = threading.Lock()
+        self._said: dict[str, float] = {}
+
+    def lets_through(self, kind: str) -> bool:
+        now = time.monotonic()
+        with self._asked:
+            self._said = {each: at for each, at in self._said.items() if now - at < SECONDS_BETWEEN_WARNINGS}
+            if kind in self._said or len(self._said) >= self.MOST:
+                return False
+            self._said[kind] = now
+            return True
 
 
 class _Input:

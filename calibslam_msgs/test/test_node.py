@@ -1,5 +1,6 @@
 """How a node's process starts and ends, and what it reports."""
 
+import itertools
 import signal
 import subprocess
 import sys
@@ -156,6 +157,27 @@ def test_inputs_and_what_the_node_adds_reach_diagnostics(nodes: tuple[Node, Node
     assert float(values["detections_hz"]) > 0.0 and float(values["detections_age_s"]) >= 0.0
     assert 2.0 <= float(values["detections_delay_s"]) < 2.0 + PATIENCE
     assert (status.level, status.message) == (DiagnosticStatus.ERROR, "errors_journal, rejected_nan")
+
+
+def test_warnings_do_not_swallow_each_other(
+    nodes: tuple[Node, Node, SingleThreadedExecutor], capfd: pytest.CaptureFixture[str]
+) -> None:
+    """Each reason is said once in a while, and each text, whatever its numbers."""
+    counters = Counters(nodes[0])
+    for n in range(3):
+        for reason in ("nan", "late"):
+            counters.reject(InvalidMeasurement(reason, f"{reason}, image {n}"))
+    for n in range(3):
+        counters.warn(f"record {n} cannot be read")
+        counters.warn("time has jumped back")
+    said = capfd.readouterr().err.splitlines()
+    assert [line.rpartition("]: ")[2] for line in said] == [
+        "left out: nan, image 0", "left out: late, image 0", "record 0 cannot be read", "time has jumped back",
+    ]  # fmt: skip
+    assert (counters["rejected_nan"], counters["rejected_late"]) == (3, 3)
+    for letters in itertools.product("abcdefgh", repeat=4):  # a peer that has a new text each time
+        counters.warn("".join(letters))
+    assert len(capfd.readouterr().err.splitlines()) < 100 and len(counters._throttle._said) <= 100
 
 
 def test_an_override_is_of_one_topic_only(nodes: tuple[Node, Node, SingleThreadedExecutor]) -> None:
