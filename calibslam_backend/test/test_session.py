@@ -127,6 +127,28 @@ def test_refinements_are_in_the_journal(tmp_path: Path) -> None:
     assert (live(tmp_path / "journal").trajectory() == first.trajectory()).all()
 
 
+def test_who_outlives_the_journal_writes_into_no_other_file(tmp_path: Path) -> None:
+    """At the end the worker is not waited for forever, and the number of the journal's file is given to the next one."""
+    session = live(tmp_path / "journal").use(MEASUREMENTS[:40])
+    size = (tmp_path / "journal").stat().st_size
+    session.intake.close()
+    with (tmp_path / "map.json").open("w"):
+        session._refine()
+        session.intake.write(CAMERA_EVENT)
+    assert (tmp_path / "map.json").stat().st_size == 0
+    assert (tmp_path / "journal").stat().st_size == size
+    assert not session.counts["errors_journal"]
+
+
+def test_reading_a_journal_can_be_ended_at_each_record(tmp_path: Path) -> None:
+    journal = Journal(tmp_path / "journal")
+    for _ in range(3):
+        journal.append(Record(99, b"?"))
+    journal.close()
+    session = Session(np.eye(4), NEVER, EstimatorSettings(), live(), Journal(tmp_path / "journal"))
+    assert len(list(session.resume(decode))) == 3
+
+
 def test_unreadable_records_are_counted(tmp_path: Path) -> None:
     session = live(tmp_path / "journal").use(MEASUREMENTS[:10])
     assert session.intake.journal is not None

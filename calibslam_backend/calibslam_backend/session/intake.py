@@ -63,7 +63,7 @@ class Intake:
 
     Attributes:
         paused: measurements are counted and ignored.
-        journal: None: nothing is kept.
+        journal: None: nothing is kept, or not any more.
         journal_problem: why the journal is not complete; "" if it is.
     """
 
@@ -115,15 +115,15 @@ class Intake:
 
     def write(self, event: Event) -> None:
         """Have the journal say that something happened. It never fails: what goes wrong is reported."""
-        if self.journal is None:
-            return
-        try:
-            with self._changed:
+        with self._changed:
+            if self.journal is None:
+                return
+            try:
                 self.journal.append(event.record())
-        except OSError as error:
-            self._report.count("errors_journal")
-            self.journal_problem = f"is not complete: {error.strerror}"
-            self._report.say(f"journal {self.journal.path} {self.journal_problem}; mapping goes on")
+            except OSError as error:
+                self._report.count("errors_journal")
+                self.journal_problem = f"is not complete: {error.strerror}"
+                self._report.say(f"journal {self.journal.path} {self.journal_problem}; mapping goes on")
 
     def begin_again(self, events: Iterable[Event], keep_queue: bool) -> None:
         """The journal holds these events, and those that wait if they are kept.
@@ -140,6 +140,8 @@ class Intake:
                 self._queue.clear()
 
     def close(self) -> None:
-        """Have the journal on disk."""
-        if self.journal is not None:
-            self.journal.close()
+        """Have the journal on disk. Whoever still works writes nothing any more: its file may be another one by then."""
+        with self._changed:
+            journal, self.journal = self.journal, None
+        if journal is not None:
+            journal.close()

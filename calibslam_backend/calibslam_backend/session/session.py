@@ -112,9 +112,9 @@ class Session:
             except ValueError as error:
                 self._report.count("errors_journal")
                 self._report.say(f"journal {journal.path}, record {n}: {error}")
-                continue
-            with self.lock:
-                self._use(event)
+            else:
+                with self.lock:
+                    self._use(event)
             self.resumed = min(n / journal.found, 0.999)
             yield
         self._guard.resumed()
