@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import threading
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
@@ -10,16 +12,22 @@ from typing import Any
 
 import numpy as np
 import pytest
+import rclpy
 from calibslam_msgs.msg import BoundingBox, BoundingBoxArray, RelativePose
 from calibslam_msgs.srv import LoadMap, SaveMap
-from live import Process, Watcher, random_domain, trajectory_of, wait_until
+from live import PATIENCE, Process, Watcher, random_domain, trajectory_of, wait_until
 from nav_msgs.msg import Path as PathMessage
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.serialization import serialize_message
 from sensor_msgs.msg import CameraInfo
 from small_world import CAMERA, SmallWorld, around, objects
 from std_srvs.srv import SetBool, Trigger
 
+from calibslam_backend.backend_node import BackendNode
 from calibslam_backend.output.metrics import ate
+from calibslam_backend.ros.event_messages_node import Decoder
+from calibslam_backend.session.intake import Event, Kind
+from calibslam_backend.session.journal import Journal, Record
 from calibslam_msgs_py.conversions import RosTypes, boxes_to_msg, camera_to_msg, motion_to_msg
 from calibslam_msgs_py.measurements import SECOND, Boxes, Camera, RelativeMotion
 from calibslam_msgs_py.node import LATCHED
@@ -213,6 +221,45 @@ def test_another_camera(robot: Robot) -> None:
     robot.camera(5 * SECOND, other)
     robot.camera(6 * SECOND)
     robot.expect(rejected_camera_changed=4)
+
+
+@pytest.fixture
+def resuming(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[BackendNode, threading.Event]]:
+    """A node in this process that reads the camera in its journal once the event is set."""
+    read = threading.Event()
+    journal = Journal(tmp_path / "journal")
+    journal.append(Record(Kind.CAMERA, serialize_message(camera_to_msg(CAMERA, 0, TYPES))))
+    journal.close()
+    recorded = Decoder.recorded
+
+    def waiting(decoder: Decoder, record: Record) -> Event:
+        read.wait(PATIENCE)
+        return recorded(decoder, record)
+
+    monkeypatch.setattr(Decoder, "recorded", waiting)
+    monkeypatch.setitem(os.environ, "ROS_DOMAIN_ID", str(random_domain()))
+    rclpy.init(args=["--ros-args", "-p", f"journal:={tmp_path / 'journal'}"])
+    node = BackendNode()
+    yield node, read
+    read.set()
+    node.close()
+    node.destroy_node()
+    rclpy.try_shutdown()
+
+
+def test_another_camera_while_the_journal_is_read(resuming: tuple[BackendNode, threading.Event]) -> None:
+    """It is rejected when the journal's is known, and with each message from then on."""
+    node, read = resuming
+    (receive,) = (s.callback for s in node.subscriptions if s.msg_type is CameraInfo)
+    other = serialize_message(camera_to_msg(replace(CAMERA, K=np.diag([1.1, 1.1, 1.0]) @ CAMERA.K), 0, TYPES))
+    for _ in range(3):
+        receive(other)
+    assert not node._counters["rejected_camera_changed"]
+    read.set()
+    wait_until(lambda: node._counters["rejected_camera_changed"] == 1, "it is not compared")
+    for _ in range(2):
+        receive(other)
+    assert node._counters["rejected_camera_changed"] == 3
 
 
 def test_pause_reset_save_and_load(robot: Robot, tmp_path: Path) -> None:

@@ -1,7 +1,8 @@
 """Node `backend`: boxes and motions in, trajectory, pose and quadrics out.
 
-The executor's thread only takes messages in; one worker thread owns the estimator, so that a slow update never
-makes a measurement wait in the network. Results depend on the measurements, not on when they come.
+The executor's thread takes messages in, and one worker thread uses them, so that a slow update never makes a
+measurement wait in the network. Only services use the estimator in the executor's thread: what comes meanwhile waits in
+the network. Results depend on the measurements, not on when they come.
 """
 
 from __future__ import annotations
@@ -87,7 +88,7 @@ class BackendNode(Node):
         load_kernels()  # before anything can come in and wait
         self._session = Session(T_body_camera, settings, estimator_settings, self, journal)
         self._decoder = Decoder(settings.map_frame, self)
-        self._camera_data = b""  # the last one that was taken
+        self._camera_data = b""  # of the one in use, if it came last
         if journal is not None:
             self._introduce(journal)
         self._stop = threading.Event()
@@ -154,11 +155,9 @@ class BackendNode(Node):
     def _take_camera(self, data: bytes, arrived: float) -> None:
         if data[BEHIND_STAMP:] == self._camera_data:  # with each image the same
             return
-        before, self._camera_data = self._session.camera, b""
-        self._session.offer_camera(self._decoder.event(Kind.CAMERA, data, arrived))
-        self._camera_data = data[BEHIND_STAMP:]
-        if before is None and (camera := self._session.camera) is not None:
-            self.get_logger().info(f"camera {camera.frame_id}: {camera.width} x {camera.height} pixels")
+        self._camera_data = b""
+        if self._session.offer_camera(self._decoder.event(Kind.CAMERA, data, arrived)):
+            self._camera_data = data[BEHIND_STAMP:]
 
     # -- worker's thread ----------------------------------------------------------------------------------------
 
@@ -169,11 +168,17 @@ class BackendNode(Node):
         while not self._stop.is_set():
             try:
                 if not self._map.publish_some(self._session):
-                    self._session.step(timeout=0.05)
+                    self._step()
                     self._publish_pose()
             except Exception as error:  # an estimate that cannot be used for now
                 self.count("errors")
                 self.say(f"publishing: {type(error).__name__}: {error}")
+
+    def _step(self) -> None:
+        before = self._session.camera
+        self._session.step(timeout=0.05)
+        if before is None and (camera := self._session.camera) is not None:
+            self.get_logger().info(f"camera {camera.frame_id}: {camera.width} x {camera.height} pixels")
 
     def _publish_pose(self) -> None:
         """As soon as there is a new one; the map has time."""

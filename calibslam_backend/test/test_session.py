@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import pickle
+import threading
 import weakref
 from collections import Counter
 from collections.abc import Callable, Sequence
@@ -86,6 +87,7 @@ class Live(Session):
 def live(journal: Path | None = None, settings: SessionSettings = NEVER) -> Live:
     session = Live(journal, settings)
     session.offer_camera(CAMERA_EVENT)
+    session.step(0.0)
     return session
 
 
@@ -253,6 +255,51 @@ def test_nothing_is_done_while_the_journal_is_read(tmp_path: Path) -> None:
     for call in (second.reset, lambda: second.save(tmp_path / "map.json")):
         with pytest.raises(NotReady, match="still being read"):
             call()
+
+
+def test_what_comes_does_not_wait_for_the_estimator() -> None:
+    session = Live()
+
+    def take_in() -> None:
+        session.offer_camera(CAMERA_EVENT)
+        session.intake.offer(event(MEASUREMENTS[0]))
+
+    taking_in = threading.Thread(target=take_in, daemon=True)
+    with session.lock:  # as during an update
+        taking_in.start()
+        taking_in.join(timeout=10.0)
+        assert not taking_in.is_alive() and len(session.intake) == 1
+    session.step(0.0)
+    assert session.camera is CAMERA
+
+
+def test_another_camera_that_came_while_the_journal_was_read(tmp_path: Path) -> None:
+    first = live(tmp_path / "journal").use(MEASUREMENTS[:10])
+    first.intake.close()
+    second = Session(np.eye(4), NEVER, EstimatorSettings(), first, Journal(tmp_path / "journal"))
+    steps = second.resume(decode)
+    other = Event(Kind.CAMERA, replace(CAMERA, K=np.diag([1.1, 1.1, 1.0]) @ CAMERA.K))
+    assert not second.offer_camera(other)  # the journal's may be the same
+    assert first.counts["rejected_camera_changed"] == 0
+    for _ in steps:
+        pass
+    assert first.counts["rejected_camera_changed"] == 1
+    with pytest.raises(InvalidMeasurement, match="camera_info changed"):
+        second.offer_camera(other)
+    assert second.offer_camera(CAMERA_EVENT)
+
+
+def test_the_camera_of_a_journal_without_one_is_that_which_came(tmp_path: Path) -> None:
+    path = tmp_path / "journal"
+    Journal(path).close()
+    first = Live(path)
+    for measurement in MEASUREMENTS[:40]:
+        first.intake.offer(event(measurement))
+    first.intake.close()
+    second = live(path)
+    assert second.counts["images"] == 20 and second.camera is CAMERA
+    second.intake.close()
+    assert live(path).counts["images"] == 20
 
 
 def test_a_start_pose_is_where_the_trajectory_begins(tmp_path: Path) -> None:

@@ -69,26 +69,23 @@ class Session:
 
     # -- taking in ----------------------------------------------------------------------------------------------
 
-    def offer_camera(self, event: Event) -> None:
-        """The camera; the first one stays.
+    def offer_camera(self, event: Event) -> bool:
+        """The camera; the first one stays. Returns whether it is the one in use; before there is one, `step` takes it.
 
         Raises:
             InvalidMeasurement: "camera_changed".
         """
-        camera = event.content
-        assert isinstance(camera, Camera)
+        assert isinstance(event.content, Camera)
         self._camera_seen = event
-        known = self._camera.content
-        if known is None:
-            if self.resumed < 1.0:
-                return  # it may be in the journal; if not, it comes again
-            with self.lock:
-                self.intake.write(event)
-                self._use(event)
-        elif not (isinstance(known, Camera) and _same(camera, known)):
+        return self._is_in_use(event.content)
+
+    def _is_in_use(self, camera: Camera) -> bool:
+        known = self.camera
+        if known is not None and not _same(camera, known):
             raise InvalidMeasurement(
                 "camera_changed", "camera_info changed; the first one stays in use until ~/reset is called"
             )
+        return known is not None
 
     @property
     def camera(self) -> Camera | None:
@@ -120,13 +117,17 @@ class Session:
         self._guard.resumed()
         self.refined = True  # as it was
         self.resumed = 1.0
-        if self.camera is None and self._camera_seen.content is not None:
-            self.offer_camera(self._camera_seen)
+        if isinstance(seen := self._camera_seen.content, Camera):  # maybe before the journal's was known
+            try:
+                self._is_in_use(seen)
+            except InvalidMeasurement as error:
+                self._report.reject(error)
 
     def step(self, timeout: float) -> None:
         """Use the next event, or refine after a rest; waits for an event at most `timeout` [s]."""
         if self.estimator is None:  # measurements wait for the camera
-            time.sleep(timeout)
+            if not self._begin_with_camera():
+                time.sleep(timeout)
             return
         self.intake.wait(timeout)
         with self.lock:
@@ -136,6 +137,14 @@ class Session:
                 self._use(event)
             elif not self.refined and now - self._used > self._settings.refine_after:
                 self._refine()
+
+    def _begin_with_camera(self) -> bool:
+        """Whether there is one."""
+        with self.lock:
+            if self.estimator is None and self._camera_seen.content is not None:
+                self.intake.write(self._camera_seen)
+                self._use(self._camera_seen)
+            return self.estimator is not None
 
     def _use(self, event: Event) -> None:
         if self.estimator is None and event.kind not in (Kind.CAMERA, Kind.RESUMED):
