@@ -130,7 +130,7 @@ def test_refinements_are_in_the_journal(tmp_path: Path) -> None:
 
 
 def test_who_outlives_the_journal_writes_into_no_other_file(tmp_path: Path) -> None:
-    """At the end the worker is not waited for forever, and the number of the journal's file is given to the next one."""
+    """The worker is not waited for forever, and the number of the journal's file is given to the next file."""
     session = live(tmp_path / "journal").use(MEASUREMENTS[:40])
     size = (tmp_path / "journal").stat().st_size
     session.intake.close()

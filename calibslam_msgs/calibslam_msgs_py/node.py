@@ -171,7 +171,7 @@ class Counters:
         self.warn(f"left out: {error}", error.reason)
 
     def warn(self, text: str, kind: str = "") -> None:
-        """Say something, if nothing of its kind was said just now; by default, texts that differ in numbers only are one."""
+        """Say something, if nothing of its kind was said just now. By default, texts that differ in numbers are one."""
         if self._throttle.lets_through(kind or re.sub(r"\d+", "#", text)):
             self._node.get_logger().warning(text)
 

@@ -140,7 +140,7 @@ class Intake:
                 self._queue.clear()
 
     def close(self) -> None:
-        """Have the journal on disk. Whoever still works writes nothing any more: its file may be another one by then."""
+        """Have the journal on disk. Who still works writes nothing more: its file may be another one by then."""
         with self._changed:
             journal, self.journal = self.journal, None
         if journal is not None:
