@@ -28,6 +28,7 @@ from calibslam_backend.association.tracking import Tracker, unique
 from calibslam_backend.estimator_settings import EstimatorSettings
 from calibslam_backend.geometry.box_measurement import undistorted
 from calibslam_backend.geometry.ellipsoid import Ellipsoid, covariance_of_pose_and_radii, covariance_of_vector
+from calibslam_backend.graph.known import Known
 from calibslam_backend.graph.measured import Motion
 from calibslam_backend.graph.noise import QUADRICSLAM
 from calibslam_backend.graph.object_graph import ObjectGraph, UpdateReport
@@ -172,11 +173,12 @@ class Estimator:
             stamps,
             self.trajectory(),
             np.reshape(covariances, (-1, 6, 6)),
-            tuple(self.quadrics()),
+            self.quadrics(),
             self.camera.frame_id,
+            self._graph.known(),
         )
 
-    def quadrics(self) -> list[QuadricEstimate]:
+    def quadrics(self) -> tuple[QuadricEstimate, ...]:
         """The map."""
         result = []
         for j, covariance in self._graph.quadric_covariances().items():
@@ -192,7 +194,7 @@ class Estimator:
                     len(self._graph.landmarks[j].boxes),
                 )
             )
-        return result
+        return tuple(result)
 
     @property
     def objects(self) -> int:
@@ -223,20 +225,25 @@ class Estimator:
             ValueError: a quadric has no covariance that it could begin with, or its id is there twice; nothing is
                 changed.
         """
-        if len({quadric.id for quadric in known.quadrics}) < len(known.quadrics):
+        quadrics = {quadric.id: quadric for quadric in known.quadrics}
+        if len(quadrics) < len(known.quadrics):
             raise ValueError("two quadrics of the map have the same id")
-        priors = [_prior_of(quadric) for quadric in known.quadrics]
+        if known.prior.quadrics.keys() - quadrics:
+            raise ValueError("the prior of the map knows quadrics that the map does not have")
+        alone = {j: _known_alone(quadric) for j, quadric in quadrics.items() if j not in known.prior.quadrics}
         self.reset()
-        if known.quadrics and self.settings.start_in_map == FOUND:
+        self._graph.frame = known.prior.frame
+        if quadrics and self.settings.start_in_map == FOUND:
             self._search.search()
-        for quadric, (vector, covariance) in zip(known.quadrics, priors, strict=True):
-            classes = Counter({quadric.class_id: max(quadric.observations, 1)})
-            self._assignments.know(quadric.id, vector, covariance, classes)
+        for j, prior in {**known.prior.quadrics, **alone}.items():
+            classes = Counter({quadrics[j].class_id: max(quadrics[j].observations, 1)})
+            self._assignments.know(j, prior, classes)
 
     def begin_again(self, keep_map: bool) -> None:
         """Forget the trajectory, and the objects unless the map is kept: then as in a loaded map."""
-        known = tuple(self.quadrics()) if keep_map else ()
-        self.load(ObjectMap((), np.zeros((0, 4, 4)), np.zeros((0, 6, 6)), known, self.camera.frame_id))
+        no_poses = (), np.zeros((0, 4, 4)), np.zeros((0, 6, 6))
+        known = (self.quadrics(), self.camera.frame_id, self._graph.known()) if keep_map else ((),)
+        self.load(ObjectMap(*no_poses, *known))
 
     def start_at(self, T_map_body: Array, error: float = START_ERROR) -> None:
         """Begin a trajectory in the map there is, where the body is said to be (4, 4), within `error` [rad, m].
@@ -400,8 +407,8 @@ class Estimator:
         )
 
 
-def _prior_of(quadric: QuadricEstimate) -> tuple[Array, Array]:
-    """Vector (9,) and covariance (9, 9) that a known quadric begins with.
+def _known_alone(quadric: QuadricEstimate) -> Known:
+    """A quadric of which nothing is known but its estimate and covariance.
 
     Raises:
         ValueError: it has none.
@@ -414,4 +421,4 @@ def _prior_of(quadric: QuadricEstimate) -> tuple[Array, Array]:
         np.linalg.cholesky(covariance)
     except np.linalg.LinAlgError:
         raise ValueError(f"the covariance of quadric {quadric.id} of the map is not positive definite") from None
-    return vector, covariance
+    return Known(vector, covariance)

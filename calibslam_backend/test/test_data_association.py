@@ -10,6 +10,7 @@ from small_map import CAMERA, FRAMES, LEFT, RIGHT, World
 
 from calibslam_backend.association.matching import GIVEN, predicted_corners
 from calibslam_backend.geometry.box_measurement import cut_alike
+from calibslam_backend.graph.known import Known
 from calibslam_backend.graph.measured import Motion
 from calibslam_backend.graph.noise import QUADRICSLAM
 from calibslam_msgs_py.measurements import Array, Boxes
@@ -34,7 +35,7 @@ def lost(
     """
     world = World(**settings)
     for j, place in enumerate(known):
-        world.books.know(j, world.cup(place), np.eye(9) * 1e-6, Counter({name: 1}))
+        world.books.know(j, Known(world.cup(place), np.eye(9) * 1e-6), Counter({name: 1}))
     for _ in range(FRAMES):
         world.show()
     motion = Motion(np.eye(4), np.eye(6) * sigma**2, 0.0, np.eye(4))
@@ -112,7 +113,7 @@ def test_quadricslam_knows_the_boxes_that_a_track_had_before_it_was_bound() -> N
         world.books.frames.append(frame)
         world.books.tracks[0].seen.append((k, 0))
         if k == 1:
-            world.books.know(0, world.cup(LEFT), np.eye(9), Counter(cup=1))
+            world.books.know(0, Known(world.cup(LEFT), np.eye(9)), Counter(cup=1))
             world.objects.bind(0, 0)
         elif k > 1:
             world.books.give(k, 0, 0)

@@ -12,6 +12,7 @@ from calibslam_backend.association import data_association
 from calibslam_backend.association.assignments import Assignments
 from calibslam_backend.association.matching import GIVEN
 from calibslam_backend.association.relocalisation import Relocalised
+from calibslam_backend.graph.known import Known
 from calibslam_backend.objects.new_quadrics import NewQuadrics
 
 
@@ -55,7 +56,7 @@ def test_tracks_of_given_identities_are_whole() -> None:
 
 def test_joined_tracks_of_a_known_object_are_bound_to_it() -> None:
     world = flickering()
-    world.books.know(7, world.cup(LEFT), np.eye(9) * 1e-4, Counter(cup=1))
+    world.books.know(7, Known(world.cup(LEFT), np.eye(9) * 1e-4), Counter(cup=1))
     world.new.start_leftovers()
     assert list(world.graph.landmarks) == [7]
     assert [world.books.tracks[track].quadric for track in range(3)] == [7] * 3

@@ -11,6 +11,7 @@ from calibslam_backend.estimator_settings import EstimatorSettings
 from calibslam_backend.geometry.box_measurement import BoxMeasurement
 from calibslam_backend.geometry.ellipsoid import Ellipsoid
 from calibslam_backend.geometry.visible_box import ALL_EDGES, box_of_visible_part, image_bounds
+from calibslam_backend.graph.known import Known
 from calibslam_backend.graph.measured import Motion
 from calibslam_backend.graph.object_graph import ObjectGraph
 from calibslam_backend.kernels import load_kernels
@@ -38,7 +39,7 @@ def graph_of_one_quadric(off: float = 0.0) -> ObjectGraph:
     place = np.eye(4)
     place[:3, 3] = 0.8, 0.1, 3.0
     known = Ellipsoid(graph.pose(0) @ place, np.array([0.1, 0.12, 0.15])).vector()
-    graph.add_known_quadric(0, known, np.eye(9) * 1e-5)
+    graph.add_known_quadric(0, Known(known.copy(), np.eye(9) * 1e-5))
     known[0] += off
     for k in range(6, 11):
         corners = box_of_visible_part(graph.pose(k), known, CAMERA.K, BOUNDS, ~ALL_EDGES)[1]

@@ -20,6 +20,7 @@ from small_world import CAMERA, SmallWorld, around, objects
 
 from calibslam_backend.estimator import EstimatorSettings
 from calibslam_backend.output.metrics import Trajectory, ate
+from calibslam_backend.graph.known import NOTHING_KNOWN
 from calibslam_backend.output.object_map import ObjectMap
 from calibslam_backend.ros.diagnostics import state
 from calibslam_backend.ros.map_services_node import MapServices
@@ -194,7 +195,7 @@ def same_id(known: ObjectMap) -> ObjectMap:
 
 
 def no_covariance(known: ObjectMap) -> ObjectMap:
-    return replace(known, quadrics=(replace(known.quadrics[0], covariance=-0.01 * np.eye(9)),))
+    return replace(known, quadrics=(replace(known.quadrics[0], covariance=-0.01 * np.eye(9)),), prior=NOTHING_KNOWN)
 
 
 @pytest.mark.parametrize("damage", [same_id, no_covariance])

@@ -15,6 +15,7 @@ import numpy as np
 
 from calibslam_backend.association.revision import Evidence
 from calibslam_backend.geometry.box_measurement import BoxMeasurement, stacked
+from calibslam_backend.graph.known import Known
 from calibslam_backend.graph.object_graph import ObjectGraph
 from calibslam_msgs_py.measurements import Array
 
@@ -99,9 +100,9 @@ class Assignments:
         for track, class_id in zip(tracks, class_ids, strict=True):
             self.tracks.setdefault(track, Candidate()).classes[class_id] += 1
 
-    def know(self, j: int, vector: Array, covariance: Array, classes: Counter[str]) -> None:
+    def know(self, j: int, known: Known, classes: Counter[str]) -> None:
         """A quadric of a loaded map."""
-        self.graph.add_known_quadric(j, vector, covariance)
+        self.graph.add_known_quadric(j, known)
         self.known.add(j)
         self.classes[j] = classes
         self._next_quadric = max(self._next_quadric, j + 1)

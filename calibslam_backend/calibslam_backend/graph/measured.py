@@ -8,6 +8,7 @@ import gtsam
 import numpy as np
 
 from calibslam_backend.geometry.box_measurement import BoxMeasurement
+from calibslam_backend.graph.known import Known
 from calibslam_msgs_py.measurements import Array
 
 
@@ -43,14 +44,14 @@ class Landmark:
 
     Attributes:
         born: keyframe.
-        prior: (9, 9) covariance.
+        prior: what was known of it to begin with.
         boxes: by keyframe.
         linearised: for each box the vector (9,) of the quadric at which it was linearised last, and what it was worth.
         residuals: (4,) of each box there.
     """
 
     born: int
-    prior: Array
+    prior: Known
     boxes: dict[int, BoxMeasurement] = field(default_factory=dict)
     linearised: dict[int, tuple[Array, float]] = field(default_factory=dict)
     residuals: dict[int, Array] = field(default_factory=dict)

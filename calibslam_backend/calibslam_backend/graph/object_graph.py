@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Hashable, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import gtsam
 import numpy as np
@@ -19,7 +19,9 @@ import numpy as np
 from calibslam_backend.geometry.box_measurement import BoxMeasurement
 from calibslam_backend.graph.box_correlation import LAGS, BoxCorrelation
 from calibslam_backend.graph.box_factor import box_factor, box_tangents, pose_information
+from calibslam_backend.graph.found_factor import found_factor
 from calibslam_backend.graph.keys import D, poses_of, q, x
+from calibslam_backend.graph.known import Known, MapPrior, conditional_factor, moved_with_map, prior_of
 from calibslam_backend.graph.measured import Landmark, Motion
 from calibslam_backend.graph.odometry_factor import DRIFT, motion_factor
 from calibslam_backend.graph.plausible import is_object, leapt
@@ -85,6 +87,8 @@ class ObjectGraph:
         self.correlation = BoxCorrelation(settings.box_correlation)
         self._origin, self._origin_sigma = T_MAP_FIRST_CAMERA, settings.prior_sigma
         thresholds = {"x": (6, self.FAR), "q": (9, np.inf), "d": (DRIFT, np.inf)}
+        self.frame = np.zeros((6, 6))  # covariance of a motion of the whole map, see `known`
+        self._beside: int | None = None  # of which known quadric the first pose was found
         self._smoother = Smoother(thresholds, self._linearise_boxes)
         self._linearised = np.zeros((0, 4, 4))  # of each pose where its factors were linearised
         self._extracted = self._smoother.values, np.zeros((0, 4, 4))  # an estimate and its poses
@@ -148,8 +152,10 @@ class ObjectGraph:
 
     def pose_covariance(self, k: int) -> Array:
         """(6, 6) [rotation, translation] of keyframe k in its body, with what the tree understates of errors that are
-        alike."""
-        return self.correlation.understated * self._smoother.marginal(x(k))
+        alike, and with what is not known of the whole map."""
+        by_frame = gtsam.Pose3(self.pose(k)).inverse().AdjointMap()
+        own = self.correlation.understated * self._smoother.marginal(x(k))
+        return np.asarray(own + by_frame @ self.frame @ by_frame.T)
 
     def distance(self, k: int, T_map_camera: Array) -> float:
         """Mahalanobis distance of keyframe k from where it is estimated to be, if it were at this pose (4, 4); by the
@@ -159,12 +165,24 @@ class ObjectGraph:
 
     def quadric_covariances(self) -> dict[int, Array]:
         """For each quadric (9, 9) of its vector, like those of poses; its prior's where no update has been done yet."""
-        own = {j: landmark.prior for j, landmark in self.landmarks.items()}
+        own = {j: landmark.prior.covariance for j, landmark in self.landmarks.items()}
         solved = [j for j in self.landmarks if self.is_solved(j)]
         for some in (solved[n : n + self.AT_ONCE] for n in range(0, len(solved), self.AT_ONCE)):
             joint = self._smoother.joint([q(j) for j in some])
-            own.update({j: np.asarray(joint.at(q(j), q(j))) for j in some})
-        return {j: self.correlation.understated * own[j] for j in self.landmarks}
+            own.update({j: self.correlation.understated * joint.at(q(j), q(j)) for j in some})
+        by_frame = {j: moved_with_map(self.quadric(j)) for j in own}
+        return {j: own[j] + G @ self.frame @ G.T for j, G in by_frame.items()}
+
+    def known(self) -> MapPrior:
+        """What is known of all quadrics, to begin with again. In a large map that takes time: two seconds for 200."""
+        solved = [j for j in self.landmarks if self.is_solved(j)]
+        new = {j: landmark.prior for j, landmark in self.landmarks.items() if j not in solved}
+        if not solved:
+            return MapPrior(self.frame, new)
+        joint = self._smoother.joint([q(j) for j in solved])
+        blocks = np.array([[joint.at(q(i), q(j)) for j in solved] for i in solved])
+        found = prior_of(solved, [self.quadric(j) for j in solved], self.correlation.understated * blocks)
+        return MapPrior(self.frame + found.frame, {**found.quadrics, **new})
 
     def joint_covariances(self, k: int, quadrics: list[int]) -> dict[int, Array]:
         """For each of these quadrics (15, 15) of pose k and the quadric: columns of `box_of_visible_part`; the
@@ -182,11 +200,27 @@ class ObjectGraph:
         self._has_origin = True
         if found is not None:
             self._origin, self._origin_sigma = found, self.FOUND_SIGMA
-        origin = gtsam.Pose3(self._origin)
-        noise = gtsam.noiseModel.Isotropic.Sigma(6, self._origin_sigma)
+        origin, sigma = gtsam.Pose3(self._origin), self._origin_sigma
         self._smoother.insert(x(0), origin)
         self._linearised = self._origin[None]
-        self._smoother.add("origin", gtsam.PriorFactorPose3(x(0), origin, noise))
+        if found is None:
+            noise = gtsam.noiseModel.Isotropic.Sigma(6, sigma)
+            self._smoother.add("origin", gtsam.PriorFactorPose3(x(0), origin, noise))
+        else:
+            noise = gtsam.noiseModel.Isotropic.Sigma(3, sigma)
+            self._smoother.add("origin", gtsam.PoseRotationPrior3D(x(0), origin, noise))
+            self._find_beside()
+
+    def _find_beside(self) -> None:
+        """The first pose is where it was found, seen from the nearest quadric that there was."""
+        known = {j: each.prior for j, each in self.landmarks.items() if each.born == 0}
+        place, sigma = self._origin[:3, 3], self._origin_sigma
+        if known:
+            j = self._beside = min(known, key=lambda j: float(np.linalg.norm(known[j].vector[:3] - place)))
+            self._smoother.add("beside", found_factor(x(0), q(j), self._origin, known[j], sigma))
+        else:
+            self._beside, noise = None, gtsam.noiseModel.Isotropic.Sigma(3, sigma)
+            self._smoother.add("beside", gtsam.PoseTranslationPrior3D(x(0), gtsam.Pose3(self._origin), noise))
 
     def add_pose(self, motion: Motion, guess: Array) -> int:
         """The next pose, after a motion from the last one; returns its number.
@@ -212,14 +246,24 @@ class ObjectGraph:
 
     def add_quadric(self, j: int, vector: Array) -> None:
         """A new quadric, first seen as this vector (9,)."""
-        self.add_known_quadric(j, vector, self._prior)
+        self.add_known_quadric(j, Known(vector, self._prior))
 
-    def add_known_quadric(self, j: int, vector: Array, covariance: Array) -> None:
-        """A quadric that is known as well as this covariance (9, 9) says."""
-        self.landmarks[j] = Landmark(self.size, covariance)
-        noise = gtsam.noiseModel.Gaussian.Covariance(covariance)
-        self._smoother.insert(q(j), vector)
-        self._smoother.add(("prior", j), gtsam.PriorFactorVector(q(j), vector, noise))
+    def add_known_quadric(self, j: int, known: Known) -> None:
+        """A quadric that is known; the one that it depends on must be there.
+
+        Raises:
+            ValueError: see `conditional`; nothing is changed.
+        """
+        factor = self._prior_factor(j, known)
+        self.landmarks[j] = Landmark(self.size, known)
+        self._smoother.insert(q(j), known.vector)
+        self._smoother.add(("prior", j), factor)
+
+    def _prior_factor(self, j: int, known: Known) -> gtsam.NonlinearFactor:
+        if known.parent is not None:
+            return conditional_factor(q(j), known, q(known.parent), self.landmarks[known.parent].prior)
+        noise = gtsam.noiseModel.Gaussian.Covariance(known.covariance)
+        return gtsam.PriorFactorVector(q(j), known.vector, noise)
 
     def add_box(self, k: int, j: int, box: BoxMeasurement) -> None:
         """A box of quadric j in keyframe k, which must be its only one there."""
@@ -236,10 +280,18 @@ class ObjectGraph:
         self._smoother.remove(("box", k, j))
 
     def remove_quadric(self, j: int) -> None:
-        """Take a quadric out, with all that was measured of it."""
+        """Take a quadric out, with all that was measured of it; what depends on it is then known by itself."""
         for k in self.landmarks.pop(j).boxes:
             self._smoother.remove(("box", k, j))
         self._smoother.remove(("prior", j))
+        for child, landmark in self.landmarks.items():
+            if landmark.prior.parent == j:
+                landmark.prior = replace(landmark.prior, parent=None)
+                self._smoother.remove(("prior", child))
+                self._smoother.add(("prior", child), self._prior_factor(child, landmark.prior))
+        if self._beside == j:
+            self._smoother.remove("beside")
+            self._find_beside()
         self._smoother.forget(q(j))
 
     # -- solving ------------------------------------------------------------------------------------------------

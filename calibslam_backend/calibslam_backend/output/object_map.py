@@ -12,6 +12,8 @@ from typing import Any, TypeVar
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from calibslam_backend.geometry.ellipsoid import Ellipsoid
+from calibslam_backend.graph.known import NOTHING_KNOWN, Known, MapPrior, conditional
 from calibslam_msgs_py.covariance import SYMMETRY_TOLERANCE, is_covariance
 from calibslam_msgs_py.measurements import SECOND, Array, QuadricEstimate
 
@@ -39,6 +41,8 @@ class ObjectMap:
         covariances: (N, 6, 6) of the poses, [rotation, translation] in the camera frame.
         quadrics: the objects, in the frame `map`.
         camera: name of the camera frame.
+        prior: what to begin with when the map is gone on with. A quadric that it lacks begins with its estimate and
+            covariance, which tell neither what it errs by together with others nor all of its shape.
     """
 
     stamps: tuple[int, ...]
@@ -46,6 +50,7 @@ class ObjectMap:
     covariances: Array
     quadrics: tuple[QuadricEstimate, ...]
     camera: str = "camera"
+    prior: MapPrior = NOTHING_KNOWN
 
     def save(self, path: Path) -> None:
         """Write it as JSON; the same map gives the same bytes. An existing file is replaced in one step."""
@@ -71,6 +76,7 @@ class ObjectMap:
                 "radii": q.radii.tolist(),
                 "covariance": q.covariance.ravel().tolist(),
                 "observations": q.observations,
+                **({"prior": _prior(self.prior.quadrics[q.id])} if q.id in self.prior.quadrics else {}),
             }
             for q in self.quadrics
         ]
@@ -79,7 +85,9 @@ class ObjectMap:
             "version": VERSION,
             "frame_id": "map",
             "camera": self.camera,
-            "units": "m, rad, ns; orientation x y z w; covariances row-major: rotation, translation (body), radii",
+            "frame_covariance": self.prior.frame.ravel().tolist(),
+            "units": "m, rad, ns; orientation x y z w; covariances row-major: rotation, translation (body), radii; "
+            "prior: centre and logarithmic shape, cross-covariance of it (rows) and its parent's",
             "quadrics": quadrics,
             "keyframes": keyframes,
         }
@@ -120,6 +128,9 @@ class ObjectMap:
             ids = Counter(quadric.id for quadric in quadrics)
             if twice := [j for j, count in ids.items() if count > 1]:
                 raise ValueError(f"quadrics: id {twice[0]} is there {ids[twice[0]]} times")
+            priors = dict(_each(content, "quadrics", _own_prior))
+            known = _in_order({j: prior for j, prior in priors.items() if prior is not None})
+            frame = _frame(content)
         except KeyError as error:
             raise _damaged(path, f"it has no {error}") from None
         except ValueError as error:
@@ -130,6 +141,7 @@ class ObjectMap:
             np.reshape([covariance for _, _, covariance in keyframes], (-1, 6, 6)),
             tuple(quadrics),
             camera,
+            MapPrior(frame, known),
         )
 
 
@@ -195,6 +207,59 @@ def _quadric(entry: dict[str, Any]) -> QuadricEstimate:
         covariance,
         _whole(entry, "observations", 0, LARGEST_COUNT),
     )
+
+
+def _frame(content: dict[str, Any]) -> Array:
+    if "frame_covariance" not in content:
+        return NOTHING_KNOWN.frame
+    covariance = _numbers(content, "frame_covariance", (6, 6))
+    if not np.allclose(covariance, covariance.T) or np.linalg.eigvalsh(covariance)[0] < -1e-9 * np.trace(covariance):
+        raise ValueError("frame_covariance is not symmetric and positive semidefinite")
+    return covariance
+
+
+def _prior(known: Known) -> dict[str, Any]:
+    return {
+        "vector": known.vector.tolist(),
+        "covariance": known.covariance.ravel().tolist(),
+        "parent": known.parent,
+        "cross_covariance": known.cross.ravel().tolist(),
+    }
+
+
+def _own_prior(entry: dict[str, Any]) -> tuple[int, Known | None]:
+    """Of a quadric: its id and prior."""
+    j = _whole(entry, "id", 0, LARGEST_ID)
+    if "prior" not in entry:
+        return j, None
+    prior = entry["prior"]
+    if not isinstance(prior, dict):
+        raise ValueError("its prior is no object of JSON")
+    vector, covariance = _numbers(prior, "vector", (9,)), _numbers(prior, "covariance", (9, 9))
+    if not np.allclose(vector, Ellipsoid(_matrix(entry), _radii(entry)).vector(), rtol=1e-6, atol=1e-6):
+        raise ValueError("its prior is of another position or shape: leave it out where you change these")
+    if not is_covariance(covariance):
+        raise ValueError("the covariance of its prior is not symmetric and positive definite, of sensible size")
+    parent = None if prior["parent"] is None else _whole(prior, "parent", 0, LARGEST_ID)
+    return j, Known(vector, covariance, parent, _numbers(prior, "cross_covariance", (9, 9)))
+
+
+def _in_order(priors: dict[int, Known]) -> dict[int, Known]:
+    """Parents before those that depend on them."""
+    result: dict[int, Known] = {}
+    left = dict(priors)
+    while left:
+        ready = [j for j, known in left.items() if known.parent is None or known.parent in result]
+        if not ready:
+            raise ValueError(f"the prior of quadric {next(iter(left))} depends on one that has none, or on itself")
+        for j in ready:
+            known = result[j] = left.pop(j)
+            if known.parent is not None:
+                try:
+                    conditional(known, result[known.parent])
+                except ValueError as error:
+                    raise ValueError(f"the prior of quadric {j}: {error}") from None
+    return result
 
 
 def _matrix(entry: dict[str, Any]) -> Array:

@@ -1,0 +1,150 @@
+"""What a map says before anything new is seen: how well its quadrics are known, and what their errors have in common.
+
+The quadrics of a map share most of their error: that of the camera when it saw them. Taken for independent, N of them
+would tell sqrt(N) times better than any of them where the map is, and a map that is begun with again and again would
+become surer each time, of nothing.
+
+What all have in common is a motion g of the whole map. Nothing that is seen in the map can tell it any more, so it is
+taken out. With G the derivative of all quadrics by g, the best estimate of g from their errors (Gauss and Markov) has
+the covariance F = (G^T S^-1 G)^-1 and does not correlate with what is left of them, so that exactly
+
+    S = G F G^T + R.
+
+F stays as it is, is part of every covariance that is published, and adds up with each start. The graph goes on with R,
+of which all together would tie every quadric to every other, and updates would take the longer the more there are. So
+each keeps its covariance with one other, the one that it has most information in common with. Of all trees that is the
+one whose distribution is nearest to the joint one (least Kullback-Leibler divergence; Chow and Liu 1968): each quadric,
+and each pair of neighbours in the tree, is known as well as it was. Given its parent p, quadric j is
+
+    q_j - v_j = A (q_p - v_p) + e,    A = R_jp R_pp^-1,    e ~ N(0, R_jj - A R_pj).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+import gtsam
+import numpy as np
+from scipy.sparse.csgraph import breadth_first_order, minimum_spanning_tree
+
+from calibslam_backend.geometry.ellipsoid import matrix_from_vector, vector_from_matrix
+from calibslam_msgs_py.measurements import Array
+
+# Information on a motion of the map that there is in any case: 10 rad and 1 km.
+UNKNOWN_FRAME = np.array([1e-2] * 3 + [1e-6] * 3)
+LEAST = 1e-8  # variance [m^2] that is left of every number, where the motion of the map tells all of it
+
+
+@dataclass(frozen=True)
+class Known:
+    """A quadric that is known.
+
+    Attributes:
+        vector: (9,) its estimate, v_j.
+        covariance: (9, 9) of it, R_jj.
+        parent: the quadric that it depends on; None: on none.
+        cross: (9, 9) R_jp: rows are its own, columns the parent's; zero without a parent.
+    """
+
+    vector: Array
+    covariance: Array
+    parent: int | None = None
+    cross: Array = field(default_factory=lambda: np.zeros((9, 9)))
+
+
+@dataclass(frozen=True)
+class MapPrior:
+    """What a map says of its quadrics.
+
+    Attributes:
+        frame: (6, 6) covariance F of a motion of the whole map, [rotation, translation] at its origin.
+        quadrics: each beside that, R; parents before those that depend on them.
+    """
+
+    frame: Array
+    quadrics: Mapping[int, Known]
+
+    def covariance(self, j: int) -> Array:
+        """(9, 9) of a quadric, all that it errs by."""
+        known = self.quadrics[j]
+        G = moved_with_map(known.vector)
+        return np.asarray(known.covariance + G @ self.frame @ G.T)
+
+
+NOTHING_KNOWN = MapPrior(np.zeros((6, 6)), {})
+
+
+def moved_with_map(vector: Array) -> Array:
+    """(9, 6) derivative G of a quadric by a motion of the whole map."""
+    L = matrix_from_vector(vector[3:])
+    G = np.zeros((9, 6))
+    for n, turn in enumerate(np.eye(3)):
+        turned = np.cross(turn, L, axisb=0, axisc=0)
+        G[3:, n] = vector_from_matrix(turned + turned.T)  # [w] L - L [w]
+        G[:3, n] = np.cross(turn, vector[:3])
+    G[:3, 3:] = np.eye(3)
+    return G
+
+
+def prior_of(quadrics: Sequence[int], vectors: Sequence[Array], blocks: Array) -> MapPrior:
+    """What is left of a map to begin with.
+
+    Args:
+        quadrics: N ids, at least one.
+        vectors: N estimates (9,).
+        blocks: (N, N, 9, 9) covariances S of and between them.
+    """
+    n = len(quadrics)
+    G = np.concatenate([moved_with_map(vector) for vector in vectors])
+    S = blocks.swapaxes(1, 2).reshape(9 * n, 9 * n)
+    frame = np.linalg.inv(G.T @ np.linalg.solve(S, G) + np.diag(UNKNOWN_FRAME))
+    R = S - G @ frame @ G.T + LEAST * np.eye(9 * n)
+    left = R.reshape(n, 9, n, 9).swapaxes(1, 2)
+    known = {quadrics[0]: Known(vectors[0], left[0, 0])}
+    for child, parent in tree(left):
+        known[quadrics[child]] = Known(vectors[child], left[child, child], quadrics[parent], left[child, parent])
+    return MapPrior(frame, known)
+
+
+def tree(blocks: Array) -> list[tuple[int, int]]:
+    """Pairs (child, parent) of the tree of Chow and Liu whose root is the first variable, parents before children.
+
+    Args:
+        blocks: (N, N, d, d) covariances of N variables.
+    """
+    n, d = len(blocks), blocks.shape[-1]
+    own = np.linalg.slogdet(blocks[range(n), range(n)])[1]
+    i, j = np.triu_indices(n, 1)
+    pairs = np.empty((len(i), 2 * d, 2 * d))
+    pairs[:, :d, :d], pairs[:, :d, d:] = blocks[i, i], blocks[i, j]
+    pairs[:, d:, :d], pairs[:, d:, d:] = blocks[j, i], blocks[j, j]
+    shared = 0.5 * (own[i] + own[j] - np.linalg.slogdet(pairs)[1])
+    weights = np.zeros((n, n))
+    weights[i, j] = -1.0 - np.maximum(shared, 0.0)  # of independent variables too: zero would be no edge
+    order, parents = breadth_first_order(minimum_spanning_tree(weights), 0, directed=False)
+    return [(int(child), int(parents[child])) for child in order[1:]]
+
+
+def conditional(known: Known, parent: Known) -> tuple[Array, Array]:
+    """A (9, 9), and the square root (9, 9) W of the information of e, W^T W its inverse covariance.
+
+    Raises:
+        ValueError: the two covariances and the one between them are none of one distribution.
+    """
+    A = np.linalg.solve(parent.covariance, known.cross.T).T
+    try:
+        root = np.linalg.cholesky(known.covariance - A @ known.cross.T)
+    except np.linalg.LinAlgError:
+        raise ValueError("its covariance with its parent is larger than their own allow") from None
+    return np.asarray(A), np.asarray(np.linalg.inv(root))
+
+
+def conditional_factor(key: int, known: Known, parent_key: int, parent: Known) -> gtsam.NonlinearFactor:
+    """Quadric `key`, given its parent; raises ValueError as `conditional`."""
+    A, W = conditional(known, parent)
+    values = gtsam.Values()
+    values.insert(key, known.vector)
+    values.insert(parent_key, parent.vector)
+    unit = gtsam.noiseModel.Unit.Create(len(W))
+    return gtsam.LinearContainerFactor(gtsam.JacobianFactor(key, W, parent_key, -W @ A, np.zeros(len(W)), unit), values)
