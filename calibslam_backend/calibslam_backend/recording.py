@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from importlib.metadata import entry_points
 from pathlib import Path
@@ -30,6 +30,18 @@ log = logging.getLogger(__name__)
 
 BOXES, RAW_BOXES, CAMERA = "/detections", "/detections_raw", "/camera/camera_info"
 MOTIONS, ODOMETRY, GROUND_TRUTH = "/relative_pose", "/odom", "/ground_truth"
+BOXES_TYPE, MOTION_TYPE, ODOMETRY_TYPE, CAMERA_TYPE = (
+    "calibslam_msgs/msg/BoundingBoxArray",
+    "calibslam_msgs/msg/RelativePose",
+    "nav_msgs/msg/Odometry",
+    "sensor_msgs/msg/CameraInfo",
+)
+# What can be named of a recording, and the types that a topic of it may have.
+NAMEABLE = {
+    "detections": (BOXES_TYPE, DETECTIONS_2D),
+    "odom": (ODOMETRY_TYPE, MOTION_TYPE),
+    "camera_info": (CAMERA_TYPE,),
+}
 
 Calibrator = Callable[[Boxes], Boxes]
 
@@ -55,53 +67,72 @@ class Recording:
         path: of the bag.
         camera: from its camera_info.
         rejected: why and how many messages or boxes were left out.
+        topics: where boxes, odometry and camera come from, by the names of `NAMEABLE`.
     """
 
     path: Path
     camera: Camera
     rejected: Counter[str]
-    _topics: dict[str, str]
+    topics: dict[str, str]
     _calibrator: Calibrator | None
 
     @classmethod
-    def open(cls, path: str | Path, calibrator: str | None = None) -> Recording:
+    def open(
+        cls, path: str | Path, calibrator: str | None = None, named: Mapping[str, str] | None = None
+    ) -> Recording:
         """A bag with boxes, a camera and odometry.
 
         Args:
             path: rosbag2 folder or .mcap file.
             calibrator: file with the model for boxes without covariance; None: the default one.
+            named: topics by the names of `NAMEABLE`, instead of the usual ones.
 
         Raises:
             BagError: it cannot be read, or misses a topic; the text says which and what is there.
         """
+        named = named or {}
         with BagReader(path) as bag:
+            cls._check(bag, named)
             foreign = [topic for topic, kind in bag.topics.items() if kind == DETECTIONS_2D]
             sources = [topic for topic in (BOXES, RAW_BOXES) if topic in bag.topics] or foreign
+            sources = [named["detections"]] if "detections" in named else sources
             if len(foreign) > 1 and sources == foreign:
-                raise BagError(f"{path} has boxes on {' and '.join(foreign)}: keep one of these topics only")
-            motions = MOTIONS if MOTIONS in bag.topics else ODOMETRY
+                raise BagError(f"{path} has boxes on {' and '.join(foreign)}: keep one of them only, or name it (--detections)")
+            motions = named.get("odom", MOTIONS if MOTIONS in bag.topics else ODOMETRY)
+            camera_info = named.get("camera_info", CAMERA)
             wanted = {f"{BOXES} or {RAW_BOXES} or any of {DETECTIONS_2D}": bool(sources)}
-            wanted |= {f"{MOTIONS} or {ODOMETRY}": motions in bag.topics, CAMERA: CAMERA in bag.topics}
+            wanted |= {f"{MOTIONS} or {ODOMETRY}": motions in bag.topics, camera_info: camera_info in bag.topics}
             missing = [names for names, there in wanted.items() if not there]
             if missing:
                 there = ", ".join(f"{name} ({bag.counts[name]})" for name in bag.topics) or "nothing"
                 raise BagError(f"{path} has no topic {' and no topic '.join(missing)}; it has: {there}")
-            camera = cls._camera(bag)
+            camera = cls._camera(bag, camera_info)
         model = load_calibrator(calibrator) if sources[0] != BOXES or calibrator else None
-        return cls(Path(path), camera, Counter(), {"boxes": sources[0], "motions": motions}, model)
+        used = {"detections": sources[0], "odom": motions, "camera_info": camera_info}
+        return cls(Path(path), camera, Counter(), used, model)
 
     @staticmethod
-    def _camera(bag: BagReader) -> Camera:
-        for _, _, message in bag.messages([CAMERA]):
+    def _check(bag: BagReader, named: Mapping[str, str]) -> None:
+        """Topics that were named are there, and of a type that can be used."""
+        for name, topic in named.items():
+            kinds = NAMEABLE[name]
+            if bag.topics.get(topic) not in kinds:
+                fitting = ", ".join(other for other, kind in bag.topics.items() if kind in kinds) or "none"
+                what = f"is {bag.topics[topic]}" if topic in bag.topics else "is not there"
+                raise BagError(f"{bag.path}: {topic} {what}; topics of {' or '.join(kinds)}: {fitting}")
+
+    @staticmethod
+    def _camera(bag: BagReader, topic: str) -> Camera:
+        for _, _, message in bag.messages([topic]):
             try:
                 return camera_from_msg(message)
             except InvalidMeasurement as error:
-                raise BagError(f"{bag.path}: {CAMERA}: {error}") from error
-        raise BagError(f"{bag.path} has no message on {CAMERA}")
+                raise BagError(f"{bag.path}: {topic}: {error}") from error
+        raise BagError(f"{bag.path} has no message on {topic}")
 
     def measurements(self) -> Iterator[Boxes | RelativeMotion]:
         """Boxes and motions in the order of their log times; what is invalid is counted in `rejected`."""
-        boxes, motions = self._topics["boxes"], self._topics["motions"]
+        boxes, motions = self.topics["detections"], self.topics["odom"]
         differencer = OdometryDifferencer()
         with BagReader(self.path) as bag:
             for topic, _, message in bag.messages([boxes, motions]):
@@ -109,7 +140,7 @@ class Recording:
                     if topic == boxes:
                         measured = self._boxes(message, bag.topics[topic])
                         yield self._calibrator(measured) if self._calibrator else measured
-                    elif topic == MOTIONS:
+                    elif bag.topics[topic] == MOTION_TYPE:
                         yield motion_from_msg(message)
                     else:
                         pose, covariance = odometry_from_msg(message)

@@ -7,7 +7,7 @@ import dataclasses
 import logging
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +18,7 @@ from calibslam_backend.keyframe import Keyframe
 from calibslam_backend.output.object_map import ObjectMap
 from calibslam_backend.output.published import POSE, TRANSFORM, camera_transform_message, map_messages, pose_message
 from calibslam_backend.output.run_folder import RunRecord, write_run
-from calibslam_backend.recording import Recording
+from calibslam_backend.recording import BOXES, CAMERA, MOTIONS, NAMEABLE, ODOMETRY, RAW_BOXES, Recording
 from calibslam_msgs_py import bags
 from calibslam_msgs_py.bags import BagError, BagReader, BagWriter, refuse_to_replace
 from calibslam_msgs_py.command import command
@@ -43,13 +43,17 @@ def main(arguments: Sequence[str] | None = None) -> int:
         metavar='"X Y Z QX QY QZ QW"',
         help="pose of the camera's optical frame in the body that odometry moves (default: %(default)s)",
     )
+    boxes, odometry = f"boxes (default: {BOXES}, or {RAW_BOXES})", f"odometry (default: {MOTIONS}, or {ODOMETRY})"
+    for name, meaning in (("detections", boxes), ("odom", odometry), ("camera_info", f"camera (default: {CAMERA})")):
+        parser.add_argument(f"--{name.replace('_', '-')}", metavar="TOPIC", help=f"topic of the {meaning}")
     add_arguments(parser, EstimatorSettings)
     parsed = parser.parse_args(arguments)
     logging.basicConfig(level=logging.WARNING, format="%(levelname)s: %(message)s")
     try:
         settings = from_arguments(parsed, EstimatorSettings)
+        named = {name: topic for name in NAMEABLE if (topic := getattr(parsed, name)) is not None}
         metrics = slam_bag(
-            parsed.bag, parsed.out, settings, parsed.calibrator, parsed.batch, parsed.camera_in_body, parsed.map
+            parsed.bag, parsed.out, settings, parsed.calibrator, parsed.batch, parsed.camera_in_body, parsed.map, named
         )
     except (BagError, SettingsError, ValueError, OSError) as error:
         print(f"error: {error}", file=sys.stderr)
@@ -76,10 +80,11 @@ def slam_bag(
     batch: bool = False,
     camera_in_body: str = "0 0 0 0 0 0 1",
     known: Path | None = None,
+    named: Mapping[str, str] | None = None,
 ) -> dict[str, object]:
     """Run the estimator over a bag and write a RUN folder; returns its metrics."""
     refuse_to_replace(out / "run.mcap", bag)
-    recording = Recording.open(bag, calibrator)
+    recording = Recording.open(bag, calibrator, named)
     estimator = Estimator(recording.camera, transform_from_text(camera_in_body), settings)
     if known is not None:
         estimator.load(ObjectMap.load(known))
@@ -120,6 +125,7 @@ def slam_bag(
         estimator, keyframes, dict(+recording.rejected), time.perf_counter() - began, (last - first) / SECOND
     )
     record.recording = str(Path(bag).resolve())
+    record.topics = recording.topics
     record.calibrator = None if calibrator is None else str(Path(calibrator).resolve())
     return write_run(out, Path(bag).name, estimator.object_map(), record, recording.ground_truth())
 

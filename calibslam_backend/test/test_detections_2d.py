@@ -139,6 +139,12 @@ def test_bags_are_read_whatever_the_topic_is_called(tmp_path: Path) -> None:
 def test_bags_with_two_of_them_or_none(tmp_path: Path) -> None:
     with pytest.raises(BagError, match="boxes on /a and /b: keep one"):
         Recording.open(record(tmp_path / "two", "/a", "/b"))
+    boxes = [
+        item
+        for item in Recording.open(tmp_path / "two", named={"detections": "/b"}).measurements()
+        if isinstance(item, Boxes)
+    ]
+    np.testing.assert_array_equal(boxes[0].corners, [[80.0, 70.0, 120.0, 90.0]])
     with pytest.raises(BagError, match="no topic /detections or /detections_raw or any of vision_msgs/msg/Detection2D"):
         Recording.open(record(tmp_path / "none"))
 

@@ -160,6 +160,19 @@ def test_odometry_poses_serve_as_well(bag: Path, tmp_path: Path) -> None:
     assert metrics["ate_m"] < 0.05
 
 
+def test_topics_may_have_other_names(bag: Path, done: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    named = {"/detections": "/my/boxes", "/relative_pose": "/my/motions", "/camera/camera_info": "/my/camera_info"}
+    path = write(tmp_path / "bag", [(named.get(t, t), s, m) for t, s, m in messages()])
+    options = ["--detections", "/my/boxes", "--odom", "/my/motions", "--camera-info", "/my/camera_info"]
+    metrics = run(path, tmp_path / "run", *options)
+    assert list(metrics["topics"].values()) == list(named.values())
+    for file in ("trajectory.tum", "map.json"):
+        assert (tmp_path / "run" / file).read_bytes() == (done / file).read_bytes()
+    assert "/nothing is not there; topics of" in fails(path, tmp_path / "x", capsys, "--detections", "/nothing")
+    said = fails(path, tmp_path / "x", capsys, "--odom", "/my/boxes")
+    assert "/my/boxes is calibslam_msgs/msg/BoundingBoxArray; topics of" in said and said.endswith(": /my/motions\n")
+
+
 def test_boxes_without_covariance_get_one(tmp_path: Path) -> None:
     raw = [("/detections_raw" if t == "/detections" else t, s, without_covariance(m)) for t, s, m in messages()]
     write(tmp_path / "bag", raw)

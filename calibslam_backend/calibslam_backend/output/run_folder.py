@@ -32,6 +32,7 @@ class RunRecord:
         associations: quadric and true identity of each box of a keyframe.
         wall_s, sequence_s: duration of the run and of the recording.
         recording: absolute path of the bag.
+        topics: its topics that were used, as `Recording` has them.
         calibrator: file that gave boxes their covariances; None: the default, or the boxes had them.
         settings: that were used, for the record.
     """
@@ -48,6 +49,7 @@ class RunRecord:
     wall_s: float
     sequence_s: float
     recording: str = ""
+    topics: dict[str, str] = field(default_factory=dict)
     calibrator: str | None = None
     settings: dict[str, Any] = field(default_factory=dict)
 
@@ -98,6 +100,7 @@ def metrics_of(result: ObjectMap, record: RunRecord, truth: Trajectory | None) -
         "peak_rss_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0,
         **({"association": vars(scores)} if scores else {}),
         "recording": record.recording,
+        "topics": record.topics,
         "calibrator": record.calibrator,
         "settings": record.settings,
     }
