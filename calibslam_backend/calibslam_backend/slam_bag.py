@@ -59,11 +59,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"error: {error}", file=sys.stderr)
         return 1
     if not metrics["keyframes"]:
-        rejected = metrics["rejected"]
+        counts = metrics["counts"]
         why = (
             f"the camera was not found in {parsed.map}: does it show objects of that map? If it starts where that map "
             "was begun, say --start-in-map begin"
-            if isinstance(rejected, dict) and "images_not_found" in rejected
+            if isinstance(counts, dict) and "images_not_found" in counts
             else "no image lies within the time of the odometry: do their clocks agree?"
         )
         print(f"error: {parsed.bag}: {why}", file=sys.stderr)
@@ -151,7 +151,8 @@ def run_record(
         boxes_used=estimator.boxes_used,
         boxes_rejected=sum(rejections.values()),
         box_correlation=estimator.box_correlation,
-        rejected={**rejections, **{k: n for k, n in counts.items() if not k.startswith("rejected_")}},
+        rejected=rejections,
+        counts={k: n for k, n in counts.items() if not k.startswith("rejected_")},
         associations=estimator.associations(),
         wall_s=wall_s,
         sequence_s=sequence_s,

@@ -63,7 +63,8 @@ def test_a_run_folder(bag: Path, tmp_path: Path, capsys: pytest.CaptureFixture[s
     assert metrics.keys() >= CONTRACT
     assert metrics["ate_m"] < metrics["odometry_ate_m"] < 0.1
     assert metrics["objects"] == 9 and metrics["association"]["precision"] > 0.95
-    assert (metrics["rejected"]["images"], metrics["rejected"]["motions"]) == (110, 109)
+    assert (metrics["counts"]["images"], metrics["counts"]["motions"]) == (110, 109)
+    assert metrics["boxes_rejected"] == sum(metrics["rejected"].values())
     assert 0.0 < metrics["update_ms"]["p50"] <= metrics["update_ms"]["p99"] <= metrics["update_ms"]["max"]
     assert metrics["sequence_s"] == pytest.approx(109 / 30, abs=0.01)
     assert (metrics["recording"], metrics["calibrator"]) == (str(bag.resolve()), None)
@@ -156,7 +157,7 @@ def test_odometry_poses_serve_as_well(bag: Path, tmp_path: Path) -> None:
     """/odom instead of /relative_pose, without covariance."""
     path = write(tmp_path / "bag", messages(odometry=True))
     metrics = run(path, tmp_path / "run")
-    assert metrics["rejected"]["motions"] == 109
+    assert metrics["counts"]["motions"] == 109
     assert metrics["ate_m"] < 0.05
 
 

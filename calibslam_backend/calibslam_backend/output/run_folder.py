@@ -28,7 +28,8 @@ class RunRecord:
         between: (N,) the longest that an image since the keyframe before took.
         boxes_used, boxes_rejected: numbers.
         box_correlation: of the errors of an object's boxes in consecutive keyframes.
-        rejected: why, and other counts.
+        rejected: what was left out, by reason.
+        counts: of all else that happened, such as images, motions, and quadrics that were merged.
         associations: quadric and true identity of each box of a keyframe.
         wall_s, sequence_s: duration of the run and of the recording.
         recording: absolute path of the bag.
@@ -45,6 +46,7 @@ class RunRecord:
     boxes_rejected: int
     box_correlation: float
     rejected: dict[str, int]
+    counts: dict[str, int]
     associations: Sequence[tuple[int | None, str]]
     wall_s: float
     sequence_s: float
@@ -93,6 +95,7 @@ def metrics_of(result: ObjectMap, record: RunRecord, truth: Trajectory | None) -
         "boxes_rejected": record.boxes_rejected,
         "box_correlation": record.box_correlation,
         "rejected": record.rejected,
+        "counts": record.counts,
         "update_ms": milliseconds(record.seconds),
         "between_ms": milliseconds(record.between),
         "wall_s": record.wall_s,
