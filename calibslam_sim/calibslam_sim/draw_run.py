@@ -1,7 +1,8 @@
-"""`draw_run RUN BAG --out DIR`: what the map says an image shows, drawn on the images of the recording.
+"""`draw_run RUN BAG --out DIR`: what the map says an image shows, drawn on the images of a recording.
 
-Each keyframe's image with the detector's boxes (thin, with ellipses of 2 sigma) and the outlines of the quadrics
-(thick), as JPEG named by its time. Where an object lies beside its outline, the map or the pose is wrong.
+Each keyframe's image with the boxes that the run was given (thin, with ellipses of 2 sigma) and the outlines of the
+quadrics (thick), as JPEG named by its time. Where an object lies beside its outline, the map or the pose is wrong.
+The boxes come from the recording that metrics.json of the run names, or from BAG where that is not there any more.
 """
 
 from __future__ import annotations
@@ -17,13 +18,14 @@ import numpy as np
 from calibslam_backend.output.object_map import MapFileError, ObjectMap
 from calibslam_backend.recording import Recording
 from calibslam_detector.images.image_conversion import decode_image, encode_jpeg
-from calibslam_detector.images.overlay import class_colour, draw_overlay
+from calibslam_detector.images.overlay import class_colour, draw_label, draw_overlay
 from calibslam_msgs_py.bags import BagError, BagReader
 from calibslam_msgs_py.command import command
 from calibslam_msgs_py.conversions import stamp_from_msg
 from calibslam_msgs_py.measurements import SECOND, Array, Boxes, Camera, InvalidMeasurement
 from calibslam_sim import topics
 from calibslam_sim.progress import Progress
+from calibslam_sim.run_report.loading import ReportError, own_recording, read_metrics
 
 POINTS = 64  # of an outline
 JPEG_QUALITY = 90
@@ -64,22 +66,34 @@ def draw(image: np.ndarray, boxes: Boxes | None, known: ObjectMap, T_map_camera:
             continue
         colour = class_colour(quadric.class_id)
         cv2.polylines(drawn, [np.rint(pixels).astype(np.int32)], True, colour, 2, cv2.LINE_AA)
-        place = tuple(np.rint(pixels.mean(axis=0)).astype(int).tolist())
-        cv2.putText(
-            drawn, f"{quadric.class_id} {quadric.id}", place, cv2.FONT_HERSHEY_SIMPLEX, 0.45, colour, 1, cv2.LINE_AA
-        )
+        draw_label(drawn, f"{quadric.class_id} {quadric.id}", pixels.mean(axis=0), colour)
     return drawn
 
 
-def draw_run(run: Path, bag_path: Path, out: Path) -> int:
+def boxes_of(run: Path, bag_path: Path) -> Recording:
+    """The recording whose boxes are drawn: the run's own, as the run used it, or the bag of the images.
+
+    Raises:
+        ReportError, BagError: metrics.json or the recording cannot be read.
+    """
+    metrics = read_metrics(run / "metrics.json")
+    return Recording.open(own_recording(metrics) or bag_path, metrics.get("calibrator"), metrics.get("topics"))
+
+
+def draw_run(run: Path, recording: Recording, bag_path: Path, out: Path) -> int:
     """Write the images; returns how many.
+
+    Args:
+        run: folder with the map.
+        recording: of the boxes.
+        bag_path: of the images.
+        out: folder for the pictures.
 
     Raises:
         MapFileError, BagError: the run or the bag cannot be read, or has no images.
     """
     known = ObjectMap.load(run / "map.json")
     poses = dict(zip(known.stamps, known.poses, strict=True))
-    recording = Recording.open(bag_path)
     boxes = {item.stamp: item for item in recording.measurements() if isinstance(item, Boxes)}
     count = 0
     with BagReader(bag_path) as bag:
@@ -112,18 +126,19 @@ def main(argv: Sequence[str] | None = None) -> int:
         prog="draw_run", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("run", type=Path, metavar="RUN", help="folder that slam_bag wrote")
-    parser.add_argument("bag", type=Path, metavar="BAG", help="its recording, with images")
+    parser.add_argument("bag", type=Path, metavar="BAG", help="recording with the images")
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder for the pictures")
     arguments = parser.parse_args(argv)
     try:
-        count = draw_run(arguments.run, arguments.bag, arguments.out)
-    except (MapFileError, BagError) as error:
+        recording = boxes_of(arguments.run, arguments.bag)
+        count = draw_run(arguments.run, recording, arguments.bag, arguments.out)
+    except (MapFileError, BagError, ReportError, ValueError) as error:
         print(f"draw_run: {error}", file=sys.stderr)
         return 1
     if not count:
         print(f"draw_run: no image of {arguments.bag} was taken at a keyframe of {arguments.run}", file=sys.stderr)
         return 1
-    print(f"{count} pictures: {arguments.out}")
+    print(f"{count} pictures: {arguments.out}; boxes: {recording.topics['detections']} of {recording.path}")
     return 0
 
 

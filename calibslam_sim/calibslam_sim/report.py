@@ -12,7 +12,7 @@ from pathlib import Path
 
 from calibslam_msgs_py.command import command
 from calibslam_sim.run_report.loading import ReportError, load_runs
-from calibslam_sim.run_report.page import page
+from calibslam_sim.run_report.page import missing, page
 
 MEGABYTE = 1e6
 
@@ -32,11 +32,15 @@ def main(argv: Sequence[str] | None = None) -> int:
     arguments = parser.parse_args(argv)
     out = arguments.out or arguments.runs[0] / "report.html"
     try:
-        text = page(load_runs(arguments.runs, arguments.recording, arguments.calibrator))
+        runs = load_runs(arguments.runs, arguments.recording, arguments.calibrator)
+        text = page(runs)
         out.write_text(text, encoding="utf-8")
     except (ReportError, OSError) as error:
         print(f"report: {error}", file=sys.stderr)
         return 1
+    for run in runs:
+        if run.recorded is None:
+            print(f"report: warning: {run.name}: {missing(run)}", file=sys.stderr)
     print(f"{out}: {len(arguments.runs)} run{'s' if len(arguments.runs) > 1 else ''}, {len(text) / MEGABYTE:.1f} MB")
     return 0
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import shutil
 import sys
 from pathlib import Path
 from types import SimpleNamespace
@@ -92,6 +94,31 @@ def test_pictures_show_boxes_and_outlines(recorded: tuple[Path, Path], capsys: p
     assert changed[places[:, 1], places[:, 0]].all()
     assert changed[10:50, 10].mean() > 0.9  # the box's left edge
     assert not changed[200:].any()
+
+
+def test_boxes_are_those_of_the_run(recorded: tuple[Path, Path], capsys: pytest.CaptureFixture[str]) -> None:
+    """The run was given other boxes than those on the usual topic of the bag with the images."""
+    run, images = recorded
+    own = images.with_name("own")
+    boxes = Boxes(
+        SECOND, 320, 240, np.array([[80.0, 60.0, 120.0, 90.0]]), np.full((1, 4, 4), np.nan), ("cup",), np.ones(1), ("",)
+    )  # fmt: skip
+    with BagWriter(own) as bag:
+        bag.write(topics.CAMERA_INFO, camera_to_msg(CAMERA, SECOND, bags.types), SECOND)
+        bag.write("/mine", boxes_to_msg(boxes, bags.types), SECOND)
+        bag.write("/relative_pose", motion_to_msg(RelativeMotion(SECOND, 2 * SECOND, np.eye(4)), bags.types), SECOND)
+    calibrator = run / "calibrator.json"
+    calibrator.write_text('{"version": 1, "kind": "per_size", "parameters": {"floor": 9.0, "relative": 0.0}}')
+    metrics = {"recording": str(own), "topics": {"detections": "/mine"}, "calibrator": str(calibrator)}
+    (run / "metrics.json").write_text(json.dumps(metrics))
+    assert draw_run.main([str(run), str(images), "--out", str(run / "pictures")]) == 0
+    assert f"boxes: /mine of {own}" in capsys.readouterr().out
+    changed = np.abs(cv2.imread(str(run / "pictures" / "1.000000.jpg")).astype(int) - 90).max(axis=2) > 40
+    assert changed[60:90, 80].mean() > 0.9 and not changed[10:50, 10].any()
+    assert changed[60 + 18, 80]  # 2 sigma of the run's own calibrator
+    shutil.rmtree(own)
+    assert draw_run.main([str(run), str(images), "--out", str(run / "pictures")]) == 1
+    assert "/mine is not there" in capsys.readouterr().err
 
 
 def test_a_bag_of_another_run_is_told(recorded: tuple[Path, Path], capsys: pytest.CaptureFixture[str]) -> None:

@@ -19,7 +19,8 @@ from calibslam_backend.geometry.box_measurement import BORDER_SIGMAS
 from calibslam_backend.geometry.ellipsoid import Ellipsoid
 from calibslam_backend.geometry.visible_box import project
 from calibslam_backend.output.object_map import ObjectMap
-from calibslam_msgs_py.bags import BagReader, BagWriter
+from calibslam_msgs_py.bags import BagReader, BagWriter, types
+from calibslam_msgs_py.conversions import boxes_to_msg
 from calibslam_msgs_py.measurements import Boxes, QuadricEstimate
 from calibslam_sim import report
 from calibslam_sim.rendering.looks import FAMILIES
@@ -178,11 +179,33 @@ def test_the_best_run_is_marked(tmp_path: Path) -> None:
 # -- what is missing, what is wrong -----------------------------------------------------------------------------------
 
 
-def test_without_recording(tmp_path: Path) -> None:
-    run = a_run(tmp_path / "run", {**METRICS, "recording": str(tmp_path / "gone")})
-    shown = " ".join(Contents(page(load_runs([run]))).text)
-    assert "recording of this run is not at hand" in shown and "No ground truth" in shown
+@pytest.mark.parametrize(
+    ("recording", "said"),
+    [({"recording": "/gone/bag"}, "its recording /gone/bag is gone"), ({}, "metrics.json names no recording")],
+)
+def test_without_recording(
+    recording: dict[str, str], said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """What is missing is the recording; whether there was ground truth, nobody knows."""
+    run = a_run(tmp_path / "run", {**METRICS, **recording})
+    assert report.main([str(run)]) == 0
+    assert f"report: warning: run: {said}; " in capsys.readouterr().err
+    shown = " ".join(Contents((run / "report.html").read_text()).text)
+    assert said in shown and "No recording of these runs" in shown and "No ground truth" not in shown
     assert "Map in space" in shown and "Heuristic" not in shown
+
+
+def test_boxes_are_those_that_the_run_was_given(bag: Path, tmp_path: Path) -> None:
+    """The recording has others, too, on the usual topic."""
+    with BagReader(bag) as reader, BagWriter(tmp_path / "bag") as writer:
+        for topic, time, data in reader.raw_messages(list(reader.topics)):
+            writer.write_raw(topic, reader.topics[topic], data, time)
+        empty = Boxes(int(SIMULATION.times[0]), 640, 480, np.empty((0, 4)), np.empty((0, 4, 4)), (), np.empty(0), ())
+        writer.write("/other", boxes_to_msg(empty, types), int(SIMULATION.times[0]))
+    for topic, count in (("/detections", len(KEYFRAMES)), ("/other", 0)):
+        metrics = {"recording": str(tmp_path / "bag"), "topics": {"detections": topic}}
+        run = load_run(a_run(tmp_path / topic[1:], metrics), "run", None, None)
+        assert run.recorded is not None and len(run.recorded.boxes) == count
 
 
 def test_without_ground_truth(bag: Path, tmp_path: Path) -> None:

@@ -28,7 +28,7 @@ def draw_overlay(image: np.ndarray, boxes: Boxes) -> np.ndarray:
                 _draw_ellipse(
                     drawn, boxes.corners[k, list(corner)], boxes.covariances[k][np.ix_(corner, corner)], colour
                 )
-        _draw_label(drawn, f"{boxes.class_ids[k]} {boxes.scores[k]:.2f}", boxes.corners[k, :2], colour)
+        draw_label(drawn, f"{boxes.class_ids[k]} {boxes.scores[k]:.2f}", boxes.corners[k, :2], colour)
     return drawn
 
 
@@ -55,7 +55,8 @@ def _draw_ellipse(image: np.ndarray, centre: Array, covariance: Array, colour: t
     )
 
 
-def _draw_label(image: np.ndarray, text: str, corner: Array, colour: tuple[int, int, int]) -> None:
+def draw_label(image: np.ndarray, text: str, corner: Array, colour: tuple[int, int, int]) -> None:
+    """Write a text above a point (2,) [px], in the image, on a dark field."""
     (width, height), _ = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, 0.4, 1)
     x = int(np.clip(corner[0], 0, max(image.shape[1] - width, 0)))
     y = int(np.clip(corner[1] - 3, height + 1, image.shape[0] - 1))

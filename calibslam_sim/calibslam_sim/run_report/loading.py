@@ -56,12 +56,14 @@ class Run:
         map: what was estimated.
         metrics: content of metrics.json, and what follows from the recording where that is missing there.
         recorded: None where the recording is not at hand.
+        missing: why it is not; "" where it is.
     """
 
     name: str
     map: ObjectMap
     metrics: dict[str, Any]
     recorded: Recorded | None
+    missing: str = ""
 
     @property
     def seconds(self) -> Array:
@@ -140,12 +142,15 @@ def load_run(folder: Path, name: str, recording: Path | None, calibrator: str | 
         raise ReportError(str(error)) from error
     if not known.stamps:
         raise ReportError(f"{folder} holds no keyframe: there is nothing to show")
-    metrics = _metrics(folder / "metrics.json")
-    source = recording or _named(metrics)
+    metrics = read_metrics(folder / "metrics.json")
+    source = recording or own_recording(metrics)
     if source is None:
-        return Run(name, known, metrics, None)
+        named = metrics.get("recording")
+        return Run(
+            name, known, metrics, None, f"its recording {named} is gone" if named else "metrics.json names no recording"
+        )
     try:
-        recorded = _recorded(source, known, calibrator or metrics.get("calibrator"))
+        recorded = _recorded(source, known, calibrator or metrics.get("calibrator"), metrics.get("topics"))
     except (BagError, ValueError) as error:
         raise ReportError(f"recording of {folder}: {error}") from error
     if recorded is None:
@@ -156,7 +161,12 @@ def load_run(folder: Path, name: str, recording: Path | None, calibrator: str | 
     )
 
 
-def _metrics(path: Path) -> dict[str, Any]:
+def read_metrics(path: Path) -> dict[str, Any]:
+    """Content of a metrics.json; empty where there is none.
+
+    Raises:
+        ReportError: it holds something else.
+    """
     if not path.exists():
         return {}
     try:
@@ -168,15 +178,17 @@ def _metrics(path: Path) -> dict[str, Any]:
     return content
 
 
-def _named(metrics: dict[str, Any]) -> Path | None:
+def own_recording(metrics: dict[str, Any]) -> Path | None:
     """The recording that a run names, if it is still there."""
     path = Path(metrics.get("recording") or "")
     return path if metrics.get("recording") and path.exists() else None
 
 
-def _recorded(path: Path, known: ObjectMap, calibrator: str | None) -> Recorded | None:
+def _recorded(
+    path: Path, known: ObjectMap, calibrator: str | None, named: dict[str, str] | None
+) -> Recorded | None:
     """The recording of a map; None if it is of another time."""
-    recording = Recording.open(path, calibrator)
+    recording = Recording.open(path, calibrator, named)
     motions: list[RelativeMotion] = []
     boxes: dict[int, Boxes] = {}
     first, last = known.stamps[0], known.stamps[-1]

@@ -76,7 +76,9 @@ def _comparison(parts: _Parts, runs: Sequence[Run]) -> None:
         "Position errors",
         "Tied to the truth at the first keyframe. A thin line above its run's error most of the time is honest.",
         trajectories.errors_of_runs(runs),
-        "No ground truth: neither errors nor NEES.",
+        "No recording of these runs is at hand, and with it no true path: no errors over time."
+        if all(run.recorded is None for run in runs)
+        else "No ground truth: neither errors nor NEES.",
     )
     parts.figure(
         "Reliability of positions",
@@ -88,11 +90,8 @@ def _comparison(parts: _Parts, runs: Sequence[Run]) -> None:
 
 
 def _of_run(parts: _Parts, run: Run) -> None:
-    no_recording = (
-        "The recording of this run is not at hand (--recording names it): no odometry, truth, boxes or images."
-    )
     if run.recorded is None:
-        parts.add(f'<p class="note">{no_recording}</p>')
+        parts.add(f'<p class="note">The recording of this run is not at hand: {escape(missing(run))}.</p>')
     parts.figure("Map from above", "Trajectory and objects with their covariances.", trajectories.from_above(run))
     parts.figure("Map in space", "Point at an object to see what is known of it.", space.in_space(run))
     parts.figure(
@@ -129,6 +128,11 @@ def _of_run(parts: _Parts, run: Run) -> None:
             f"Errors against the true objects seen from the true poses. {_correlation(true)}",
             boxes.reliability_of_boxes(true),
         )
+
+
+def missing(run: Run) -> str:
+    """Why the recording of a run is not at hand, what is left out without it, and how to name it."""
+    return f"{run.missing}; without it there are no odometry, truth, boxes and images; --recording BAG names one"
 
 
 def _correlation(seen: Sightings) -> str:
