@@ -24,4 +24,10 @@ def test_demo_makes_maps_of_boxes_and_of_images(
         assert all((tmp_path / condition.name / name).is_file() for name in demo.RESULTS)
         (row,) = (line for line in shown.splitlines() if line.startswith(condition.title))
         assert f"{metrics['ate_m']:.3f}" in row
+        assert (metrics["recording"], metrics["topics"]["detections"]) == (
+            str(tmp_path / "detected"), condition.detections
+        )  # fmt: skip
+    page = (tmp_path / "report.html").read_text()
+    assert f"{tmp_path}/report.html" in shown and page.count("at the true objects") == len(demo.CONDITIONS)
+    assert "not at hand" not in page and "data:image/jpeg" in page
     assert cv2.imread(str(tmp_path / "overlay.png")).shape == (480, 640, 3)

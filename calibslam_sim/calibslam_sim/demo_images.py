@@ -31,15 +31,14 @@ def record(settings: SimulationSettings, bag: Path) -> None:
 
 
 def detect(bag: Path, out: Path) -> int:
-    """Write `out`: `bag` without its images, but with the boxes on them that the shipped detector finds; returns
-    how many these are.
+    """Write `out`: `bag` with the boxes that the shipped detector finds in its images; returns how many these are.
 
     Raises:
         WeightsError: the shipped weights cannot be used.
     """
     # One thread: several get in each other's way where the machine has something else to do.
     detector = Detector.from_file(SHIPPED, DetectorSettings(threads=1))
-    return detect_bag(bag, out, detector, DetectBagSettings(topic=DETECTED, images=False), overwrite=True).boxes
+    return detect_bag(bag, out, detector, DetectBagSettings(topic=DETECTED), overwrite=True).boxes
 
 
 def write_overlay(bag: Path, detected: Path, file: Path) -> None:

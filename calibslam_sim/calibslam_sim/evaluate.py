@@ -84,12 +84,19 @@ def table(metrics: dict[str, Any]) -> str:
     objects = metrics.get("object_accuracy")
     if objects:
         lines += [
-            f"{'  of true ones':24}{objects['matched']:>7} of {objects['true']}",
+            f"{'  of true ones':24}{found_objects(objects):>12}",
             f"{'  centre error [m]':24}{objects['centre_m']:>12.3f}",
             f"{'  error of radii':24}{objects['radii']:>12.0%}",
             f"{'  3-D IoU':24}{objects['iou']:>12.2f}",
         ]
     return "\n".join(lines)
+
+
+def found_objects(objects: dict[str, Any]) -> str:
+    """How many of the true objects a map has, and how many of its own are none."""
+    none = objects["estimated"] - objects["matched"]
+    found = f"{objects['matched']} of {objects['true']}"
+    return f"{found}, {none} that {'is' if none == 1 else 'are'} none" if none else found
 
 
 def _row(name: str, metrics: dict[str, Any], key: str, style: str) -> str:

@@ -84,6 +84,12 @@ def test_odometry_alone_is_measured_too(run: Path, bag: Path) -> None:
     assert metrics["odometry_rpe_m"] == pytest.approx(step, rel=0.5)
     assert 0.2 < metrics["odometry_nees_position"] < 15.0
     assert "estimate" in evaluate.table(metrics)
+    assert "  4 of 19\n" in evaluate.table(metrics)
+
+
+def test_objects_that_are_none_are_told() -> None:
+    for estimated, told in ((4, "4 of 19"), (5, "4 of 19, 1 that is none"), (6, "4 of 19, 2 that are none")):
+        assert evaluate.found_objects({"true": 19, "matched": 4, "estimated": estimated}) == told
 
 
 def test_a_tum_folder_or_file_is_a_reference(run: Path, tmp_path: Path) -> None:
