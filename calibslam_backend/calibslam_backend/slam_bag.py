@@ -33,7 +33,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Entry of the executable; returns the exit code."""
     parser = argparse.ArgumentParser(prog="slam_bag", description=__doc__)
     parser.add_argument("bag", help="rosbag2 folder or .mcap file with boxes, odometry and camera_info")
-    parser.add_argument("--out", required=True, type=Path, metavar="RUN", help="folder for the result")
+    parser.add_argument(
+        "--out", required=True, type=Path, metavar="RUN", help="folder for the result; that of an earlier run is replaced"
+    )
     parser.add_argument("--calibrator", metavar="FILE", help="model for boxes without covariance")
     parser.add_argument("--map", type=Path, metavar="FILE", help="map.json to go on with")
     parser.add_argument("--batch", action="store_true", help="optimise the whole graph once more at the end")
@@ -49,6 +51,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     add_arguments(parser, EstimatorSettings)
     parsed = parser.parse_args(arguments)
     logging.basicConfig(level=logging.WARNING, format="%(levelname)s: %(message)s")
+    replaces = (parsed.out / "metrics.json").exists()
     try:
         settings = from_arguments(parsed, EstimatorSettings)
         named = {name: topic for name in NAMEABLE if (topic := getattr(parsed, name)) is not None}
@@ -68,7 +71,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         )
         print(f"error: {parsed.bag}: {why}", file=sys.stderr)
         return 1
-    _summary(parsed.out, metrics)
+    _summary(parsed.out, metrics, replaces)
     return 0
 
 
@@ -183,7 +186,7 @@ class _Progress:
             print("\r\033[K", end="", file=sys.stderr)
 
 
-def _summary(out: Path, metrics: dict[str, object]) -> None:
+def _summary(out: Path, metrics: dict[str, object], replaces: bool) -> None:
     def metre(value: object) -> str:
         return f"{value:.3f} m" if isinstance(value, float) else "no ground truth"
 
@@ -191,7 +194,7 @@ def _summary(out: Path, metrics: dict[str, object]) -> None:
         f"{metrics['keyframes']} keyframes, {metrics['objects']} objects, "
         f"{metrics['boxes_used']} boxes used, {metrics['boxes_rejected']} rejected\n"
         f"ATE {metre(metrics['ate_m'])} (odometry alone: {metre(metrics['odometry_ate_m'])})\n"
-        f"result: {out}, picture: {out / 'trajectory.png'}"
+        f"result: {out}{' (instead of the run that was there)' if replaces else ''}, picture: {out / 'trajectory.png'}"
     )
 
 

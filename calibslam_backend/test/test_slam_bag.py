@@ -148,9 +148,11 @@ def test_a_camera_outside_the_map_is_told(
     assert "was not found in" in said and "--start-in-map begin" in said
 
 
-def test_a_run_is_replaced_by_the_next(bag: Path, tmp_path: Path) -> None:
+def test_a_run_is_replaced_by_the_next(bag: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     run(bag, tmp_path / "run", "--noise-model", "fixed")
+    assert "instead of" not in capsys.readouterr().out
     assert run(bag, tmp_path / "run")["settings"]["noise_model"] == "calibrated"
+    assert f"result: {tmp_path}/run (instead of the run that was there)" in capsys.readouterr().out
 
 
 def test_odometry_poses_serve_as_well(bag: Path, tmp_path: Path) -> None:

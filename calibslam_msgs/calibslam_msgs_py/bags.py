@@ -188,7 +188,7 @@ class BagWriter:
         self.path = Path(path)
         if self.path.exists() or self.path.is_symlink():
             if not overwrite:
-                raise BagError(f"{self.path} exists already; remove it or choose another path")
+                raise BagError(f"{self.path} exists already; choose another path, or replace it: --overwrite")
             _remove_bag(self.path)
         self._single_file = self.path.suffix == ".mcap"
         # rosbags writes folders only: a single file is written in one beside it, and moved out at the end.
