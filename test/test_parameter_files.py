@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+from importlib.metadata import entry_points
 from pathlib import Path
 
 import pytest
@@ -47,6 +49,21 @@ def test_every_setting_is_explained() -> None:
             for field, _ in fields:
                 k = next(i for i, line in enumerate(lines) if line.startswith(f"    {field.name}:"))
                 assert lines[k - 1].startswith("    # "), field.name
+
+
+@pytest.mark.parametrize("executable", ["backend", "detection2d", "record"])
+def test_a_node_says_what_it_is(executable: str, capsys: pytest.CaptureFixture[str]) -> None:
+    """And starts nothing; the file that it names is there."""
+    (point,) = (p for p in entry_points(group="console_scripts") if p.name == executable and "calibslam" in p.module)
+    main = point.load()
+    for flag in ("-h", "--help"):
+        assert main([flag, "--ros-args", "-p", "no:=parameter"]) == 0
+        said = capsys.readouterr().out
+        assert f"Node `{executable}`: " in said and " -> " in said
+        files = re.findall(r"calibslam_\w+/config/\w+\.yaml", said)
+        assert all((PROJECT / file).exists() for file in files)
+        assert len(files) == (executable != "detection2d")
+        assert ("no parameters" in said) == (executable == "detection2d")
 
 
 def test_elsewhere_it_refuses(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -31,6 +31,7 @@ from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.signals import SignalHandlerOptions
 
 from calibslam_msgs_py.measurements import SECOND, InvalidMeasurement
+from calibslam_msgs_py.parameter_files import NodeParameters
 from calibslam_msgs_py.settings import SettingsError
 
 # Raw sensor input: best effort, so that it connects to every publisher.
@@ -67,12 +68,17 @@ def run(node_factory: Callable[[], Node], args: Sequence[str] | None = None) -> 
 
     Both signals end it with 0, after the callback that runs; a second one ends it at once. A bad or unknown
     parameter ends it with 2 and a line that says why. `node.close()`, where there is one, is called at the
-    end and may still publish.
+    end and may still publish. With -h or --help nothing is started: it is said what the node does.
 
     Args:
         node_factory: makes the node; called after rclpy is initialised.
         args: as on the command line; None: those of this process.
     """
+    words = list(sys.argv[1:] if args is None else args)
+    before_ros = words[: words.index("--ros-args")] if "--ros-args" in words else words
+    if {"-h", "--help"} & set(before_ros):
+        print(help_text(node_factory))
+        return 0
     stop = threading.Event()
 
     def on_signal(number: int, frame: object) -> None:
@@ -105,6 +111,24 @@ def run(node_factory: Callable[[], Node], args: Sequence[str] | None = None) -> 
             node.destroy_node()
         rclpy.try_shutdown()
     return 0
+
+
+def help_text(node_factory: Callable[[], Node]) -> str:
+    """What a node does, its topics and its parameters: from the docstrings of its module and of its class."""
+    module = sys.modules[node_factory.__module__]
+    name = module.__spec__.name if module.__spec__ else module.__name__  # that of what runs is __main__
+    package, _, rest = name.partition(".")
+    executable = rest.removesuffix("_node")
+    file = f"{package}/config/{executable}.yaml"
+    start = f"./calibslam run {package} {executable}"
+    lines = [
+        f"usage: {start} [--ros-args -r FROM:=TO -p NAME:=VALUE --params-file FILE]",
+        (module.__doc__ or "").strip(),
+        f"topics: {(node_factory.__doc__ or 'see the documentation').strip().rstrip('.')}",
+    ]
+    has_parameters = NodeParameters.of_module(package, executable, module).settings
+    lines.append(f"parameters: {file} has all of them, with meanings and defaults" if has_parameters else "no parameters")
+    return "\n\n".join(lines)
 
 
 def make_executor(context: Context | None = None) -> Executor:
