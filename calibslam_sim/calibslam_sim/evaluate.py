@@ -1,6 +1,7 @@
 """`evaluate`: how good a run is, against the truth in a bag or a TUM folder.
 
-Reads map.json of the run; writes the result into its metrics.json, and trajectory.tum and trajectory.png anew.
+Reads map.json of the run; writes the result into its metrics.json, and trajectory.tum and trajectory.png anew. Of a
+map file instead of a folder the result is printed only: what lies beside it may be of another run.
 """
 
 from __future__ import annotations
@@ -28,31 +29,47 @@ from calibslam_sim.accuracy.objects import map_objects, object_accuracy
 from calibslam_sim.accuracy.reference import NoReference, Reference, read_reference
 
 
-def evaluate(folder: Path, reference: Reference) -> dict[str, Any]:
-    """Metrics of a RUN folder; writes metrics.json and the trajectory there.
+def evaluate(run: Path, reference: Reference) -> dict[str, Any]:
+    """Metrics of a RUN folder, or of a map file; writes metrics.json and the trajectory into the folder.
 
     Raises:
         MapFileError: the run has no readable map.json.
         NoGroundTruth: fewer than three keyframes have ground truth.
     """
-    result = ObjectMap.load(folder / "map.json")
+    result = ObjectMap.load(run if run.is_file() else run / "map.json")
+    odometry = odometry_at(result, reference.motions)
+    found = _measured(result, reference, odometry)
+    if not run.is_file():
+        _write(run, result, reference, odometry, found)
+    return found
+
+
+def _measured(result: ObjectMap, reference: Reference, odometry: tuple[Array, Array] | None) -> dict[str, Any]:
     truth = reference.truth
     T_world_map = alignment(Trajectory(np.array(result.stamps), result.poses), truth)
     found: dict[str, Any] = accuracy(result.stamps, result.poses, result.covariances, truth)
     found |= {"keyframes": len(result.stamps), "objects": len(result.quadrics)}
-    odometry = odometry_at(result, reference.motions)
     if odometry is not None:
         found |= accuracy(result.stamps, *odometry, truth, "odometry_")
     if reference.objects is not None:
         estimated = map_objects(result.quadrics, T_world_map)
         found["object_accuracy"] = asdict(object_accuracy(estimated, reference.objects))
+    return found
+
+
+def _write(
+    folder: Path,
+    result: ObjectMap,
+    reference: Reference,
+    odometry: tuple[Array, Array] | None,
+    found: dict[str, Any],
+) -> None:
     (folder / "trajectory.tum").write_text(tum_lines(result.stamps, result.poses), encoding="utf-8")
     path = folder / "metrics.json"
     before = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
     path.write_text(json.dumps({**before, **found}, indent=1) + "\n", encoding="utf-8")
     if odometry is not None:
-        plot_run(folder / "trajectory.png", folder.name, result, odometry[0], truth)
-    return found
+        plot_run(folder / "trajectory.png", folder.name, result, odometry[0], reference.truth)
 
 
 def odometry_at(result: ObjectMap, motions: Sequence[RelativeMotion]) -> tuple[Array, Array] | None:
@@ -111,7 +128,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(
         prog="evaluate", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("run", type=Path, metavar="RUN", help="folder that slam_bag or save_map wrote")
+    parser.add_argument("run", type=Path, metavar="RUN", help="folder that slam_bag wrote, or a map file")
     parser.add_argument(
         "--reference",
         type=Path,

@@ -87,6 +87,18 @@ def test_odometry_alone_is_measured_too(run: Path, bag: Path) -> None:
     assert "  4 of 19\n" in evaluate.table(metrics)
 
 
+def test_a_map_file_is_evaluated_and_nothing_beside_it_changed(
+    run: Path, bag: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert evaluate.main([str(run), "--reference", str(bag), "--json"]) == 0
+    of_folder = capsys.readouterr().out
+    (run / "map.json").rename(run / "live_map.json")
+    before = {file.name: file.read_bytes() for file in run.iterdir()}
+    assert evaluate.main([str(run / "live_map.json"), "--reference", str(bag), "--json"]) == 0
+    assert capsys.readouterr().out == of_folder
+    assert {file.name: file.read_bytes() for file in run.iterdir()} == before
+
+
 def test_objects_that_are_none_are_told() -> None:
     for estimated, told in ((4, "4 of 19"), (5, "4 of 19, 1 that is none"), (6, "4 of 19, 2 that are none")):
         assert evaluate.found_objects({"true": 19, "matched": 4, "estimated": estimated}) == told
