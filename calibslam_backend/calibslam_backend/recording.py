@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from calibslam_backend.geometry.ellipsoid import Ellipsoid
 from calibslam_backend.odometry.motion_chain import OdometryDifferencer
 from calibslam_backend.output.metrics import Trajectory
 from calibslam_msgs_py.bags import BagError, BagReader
@@ -20,6 +21,7 @@ from calibslam_msgs_py.conversions import (
     camera_from_msg,
     motion_from_msg,
     odometry_from_msg,
+    quadrics_from_msg,
     stamped_pose_from_msg,
     valid_boxes,
 )
@@ -30,6 +32,7 @@ log = logging.getLogger(__name__)
 
 BOXES, RAW_BOXES, CAMERA = "/detections", "/detections_raw", "/camera/camera_info"
 MOTIONS, ODOMETRY, GROUND_TRUTH = "/relative_pose", "/odom", "/ground_truth"
+TRUE_OBJECTS, TRUE_OBJECTS_TYPE = "/ground_truth_quadrics", "calibslam_msgs/msg/QuadricArray"
 BOXES_TYPE, MOTION_TYPE, ODOMETRY_TYPE, CAMERA_TYPE = (
     "calibslam_msgs/msg/BoundingBoxArray",
     "calibslam_msgs/msg/RelativePose",
@@ -77,9 +80,7 @@ class Recording:
     _calibrator: Calibrator | None
 
     @classmethod
-    def open(
-        cls, path: str | Path, calibrator: str | None = None, named: Mapping[str, str] | None = None
-    ) -> Recording:
+    def open(cls, path: str | Path, calibrator: str | None = None, named: Mapping[str, str] | None = None) -> Recording:
         """A bag with boxes, a camera and odometry.
 
         Args:
@@ -97,7 +98,9 @@ class Recording:
             sources = [topic for topic in (BOXES, RAW_BOXES) if topic in bag.topics] or foreign
             sources = [named["detections"]] if "detections" in named else sources
             if len(foreign) > 1 and sources == foreign:
-                raise BagError(f"{path} has boxes on {' and '.join(foreign)}: keep one of them only, or name it (--detections)")
+                raise BagError(
+                    f"{path} has boxes on {' and '.join(foreign)}: keep one of them only, or name it (--detections)"
+                )
             motions = named.get("odom", MOTIONS if MOTIONS in bag.topics else ODOMETRY)
             camera_info = named.get("camera_info", CAMERA)
             wanted = {f"{BOXES} or {RAW_BOXES} or any of {DETECTIONS_2D}": bool(sources)}
@@ -184,3 +187,15 @@ class Recording:
             return None
         stamps = sorted(poses)
         return Trajectory(np.array(stamps), np.stack([poses[stamp] for stamp in stamps]))
+
+    def true_objects(self) -> tuple[Ellipsoid, ...] | None:
+        """The true objects in the frame of the true trajectory, if the bag has them."""
+        with BagReader(self.path) as bag:
+            if bag.topics.get(TRUE_OBJECTS) != TRUE_OBJECTS_TYPE:
+                return None
+            for _, _, message in bag.messages([TRUE_OBJECTS]):
+                try:
+                    return tuple(Ellipsoid(each.T_map_object, each.radii) for each in quadrics_from_msg(message))
+                except InvalidMeasurement as error:
+                    self.reject(error)
+        return None

@@ -34,7 +34,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="slam_bag", description=__doc__)
     parser.add_argument("bag", help="rosbag2 folder or .mcap file with boxes, odometry and camera_info")
     parser.add_argument(
-        "--out", required=True, type=Path, metavar="RUN", help="folder for the result; that of an earlier run is replaced"
+        "--out",
+        required=True,
+        type=Path,
+        metavar="RUN",
+        help="folder for the result; that of an earlier run is replaced",
     )
     parser.add_argument("--calibrator", metavar="FILE", help="model for boxes without covariance")
     parser.add_argument("--map", type=Path, metavar="FILE", help="map.json to go on with")
@@ -130,7 +134,8 @@ def slam_bag(
     record.recording = str(Path(bag).resolve())
     record.topics = recording.topics
     record.calibrator = None if calibrator is None else str(Path(calibrator).resolve())
-    return write_run(out, Path(bag).name, estimator.object_map(), record, recording.ground_truth())
+    truth, objects = recording.ground_truth(), recording.true_objects() or ()
+    return write_run(out, Path(bag).name, estimator.object_map(), record, truth, objects)
 
 
 def run_record(

@@ -17,6 +17,7 @@ from small_bag import WORLD, Message, messages, write
 
 from calibslam_backend import slam_bag
 from calibslam_backend.output.object_map import ObjectMap
+from calibslam_backend.recording import Recording
 from calibslam_msgs_py import bags
 from calibslam_msgs_py import conversions as c
 from calibslam_msgs_py.bags import BagReader
@@ -153,6 +154,20 @@ def test_a_run_is_replaced_by_the_next(bag: Path, tmp_path: Path, capsys: pytest
     assert "instead of" not in capsys.readouterr().out
     assert run(bag, tmp_path / "run")["settings"]["noise_model"] == "calibrated"
     assert f"result: {tmp_path}/run (instead of the run that was there)" in capsys.readouterr().out
+
+
+def test_true_objects_are_read_and_drawn(done: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """What is none of them, of this topic or of this type, does not matter."""
+    known = ObjectMap.load(done / "map.json").quadrics
+    true = ("/ground_truth_quadrics", WORLD.stamps[0], c.quadrics_to_msg(WORLD.stamps[0], known, bags.types, "world"))
+    objects = Recording.open(write(tmp_path / "bag", [*messages(), true])).true_objects()
+    assert objects is not None and len(objects) == len(known)
+    np.testing.assert_allclose(objects[3].T_world_object, known[3].T_map_object, atol=1e-12)
+    run(tmp_path / "bag", tmp_path / "run")
+    pictures = [folder / "trajectory.png" for folder in (done, tmp_path / "run")]
+    assert pictures[0].read_bytes() != pictures[1].read_bytes()
+    other = [(topic if topic != "/odom" else "/ground_truth_quadrics", s, m) for topic, s, m in messages(odometry=True)]
+    assert Recording.open(write(tmp_path / "other", [*other, *messages()])).true_objects() is None
 
 
 def test_odometry_poses_serve_as_well(bag: Path, tmp_path: Path) -> None:

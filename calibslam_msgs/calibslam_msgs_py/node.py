@@ -127,7 +127,9 @@ def help_text(node_factory: Callable[[], Node]) -> str:
         f"topics: {(node_factory.__doc__ or 'see the documentation').strip().rstrip('.')}",
     ]
     has_parameters = NodeParameters.of_module(package, executable, module).settings
-    lines.append(f"parameters: {file} has all of them, with meanings and defaults" if has_parameters else "no parameters")
+    lines.append(
+        f"parameters: {file} has all of them, with meanings and defaults" if has_parameters else "no parameters"
+    )
     return "\n\n".join(lines)
 
 

@@ -171,7 +171,7 @@ def test_definitions_inside_the_bag_are_used(tmp_path: Path) -> None:
 def test_nothing_is_overwritten_unasked(tmp_path: Path) -> None:
     for name in ("bag", "run.mcap"):
         path = write(tmp_path / name)
-        with pytest.raises(BagError, match="exists already; .*--overwrite"):
+        with pytest.raises(BagError, match=r"exists already; .*--overwrite"):
             BagWriter(path)
         write(path, n=3, overwrite=True)
         with BagReader(path) as bag:

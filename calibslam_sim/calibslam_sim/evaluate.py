@@ -69,7 +69,8 @@ def _write(
     before = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
     path.write_text(json.dumps({**before, **found}, indent=1) + "\n", encoding="utf-8")
     if odometry is not None:
-        plot_run(folder / "trajectory.png", folder.name, result, odometry[0], reference.truth)
+        objects = [thing.ellipsoid for thing in reference.objects or ()]
+        plot_run(folder / "trajectory.png", folder.name, result, odometry[0], reference.truth, objects)
 
 
 def odometry_at(result: ObjectMap, motions: Sequence[RelativeMotion]) -> tuple[Array, Array] | None:

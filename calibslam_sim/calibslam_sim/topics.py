@@ -18,7 +18,7 @@ IMAGE = "/camera/image_raw/compressed"
 RAW_IMAGE = "/camera/image_raw"
 DEPTH = "/camera/depth/image_raw"
 COMPRESSED_DEPTH = "/camera/depth/image_raw/compressedDepth"
-GROUND_TRUTH_QUADRICS = "/ground_truth_quadrics"
+GROUND_TRUTH_QUADRICS = recording.TRUE_OBJECTS
 
 WORLD = "world"  # frame of the ground truth
 

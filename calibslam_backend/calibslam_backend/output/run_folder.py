@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from calibslam_backend.geometry.ellipsoid import Ellipsoid
 from calibslam_backend.output.metrics import NoGroundTruth, Trajectory, association_scores, ate, position_nees, rpe
 from calibslam_backend.output.object_map import ObjectMap, tum_lines
 from calibslam_backend.output.plots import plot_run
@@ -110,14 +111,19 @@ def metrics_of(result: ObjectMap, record: RunRecord, truth: Trajectory | None) -
 
 
 def write_run(
-    folder: Path, title: str, result: ObjectMap, record: RunRecord, truth: Trajectory | None
+    folder: Path,
+    title: str,
+    result: ObjectMap,
+    record: RunRecord,
+    truth: Trajectory | None,
+    objects: Sequence[Ellipsoid] = (),
 ) -> dict[str, Any]:
-    """Write everything but `run.mcap`; returns the metrics."""
+    """Write everything but `run.mcap`; returns the metrics. `objects` are the true ones, in the frame of `truth`."""
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "trajectory.tum").write_text(tum_lines(result.stamps, result.poses), encoding="utf-8")
     result.save(folder / "map.json")
     metrics = metrics_of(result, record, truth)
     (folder / "metrics.json").write_text(json.dumps(metrics, indent=1) + "\n", encoding="utf-8")
     if result.stamps:
-        plot_run(folder / "trajectory.png", title, result, record.odometry[0], truth)
+        plot_run(folder / "trajectory.png", title, result, record.odometry[0], truth, objects)
     return metrics

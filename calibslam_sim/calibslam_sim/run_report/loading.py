@@ -15,10 +15,8 @@ from calibslam_backend.output.metrics import NoGroundTruth, Trajectory, alignmen
 from calibslam_backend.output.object_map import MapFileError, ObjectMap
 from calibslam_backend.output.run_folder import accuracy
 from calibslam_backend.recording import Recording
-from calibslam_msgs_py.bags import BagError, BagReader
-from calibslam_msgs_py.conversions import quadrics_from_msg
+from calibslam_msgs_py.bags import BagError
 from calibslam_msgs_py.measurements import SECOND, Array, Boxes, Camera, RelativeMotion
-from calibslam_sim import topics
 from calibslam_sim.evaluate import odometry_at
 
 
@@ -184,9 +182,7 @@ def own_recording(metrics: dict[str, Any]) -> Path | None:
     return path if metrics.get("recording") and path.exists() else None
 
 
-def _recorded(
-    path: Path, known: ObjectMap, calibrator: str | None, named: dict[str, str] | None
-) -> Recorded | None:
+def _recorded(path: Path, known: ObjectMap, calibrator: str | None, named: dict[str, str] | None) -> Recorded | None:
     """The recording of a map; None if it is of another time."""
     recording = Recording.open(path, calibrator, named)
     motions: list[RelativeMotion] = []
@@ -208,15 +204,6 @@ def _recorded(
         recording.camera,
         tuple(boxes[stamp] for stamp in sorted(boxes)),
         recording.ground_truth(),
-        _true_objects(path),
+        recording.true_objects(),
         None if odometry is None else odometry[0],
     )
-
-
-def _true_objects(path: Path) -> tuple[Ellipsoid, ...] | None:
-    with BagReader(path) as bag:
-        if topics.GROUND_TRUTH_QUADRICS not in bag.topics:
-            return None
-        for _, _, message in bag.messages([topics.GROUND_TRUTH_QUADRICS]):
-            return tuple(Ellipsoid(each.T_map_object, each.radii) for each in quadrics_from_msg(message))
-    return None
