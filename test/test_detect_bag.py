@@ -123,6 +123,7 @@ def test_images_that_cannot_be_decoded_are_left_out_and_counted(tmp_path: Path) 
 @pytest.mark.parametrize(
     ("options", "message"),
     [
+        (["--image", "/nowhere"], "no images on /nowhere; choose by --image-topic"),
         (["--image-topic", "/nowhere"], "choose by --image-topic: /camera/image_raw/compressed"),
         (["--weights", "nothing.pt"], "weights file nothing.pt cannot be read"),
     ],

@@ -167,6 +167,10 @@ def main(argv: Sequence[str] | None = None) -> int:
         help="detector that `train` wrote (default: the shipped)",
     )
     add_arguments(parser, DetectBagSettings)
+    parser.add_argument(
+        "--image", dest="image_topic", default=argparse.SUPPRESS, metavar="TOPIC",
+        help="the same as --image-topic, as `visual_odometry_bag` has it",
+    )  # fmt: skip
     add_arguments(parser, DetectorSettings)
     arguments = parser.parse_args(argv)
     try:

@@ -136,8 +136,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     except (bags.BagError, CocoError) as error:
         print(f"simulate: {error}", file=sys.stderr)
         return 1
+    rendered = -(-len(simulation.times) // arguments.image_every)
+    pictures = f"{rendered} images" if arguments.images else "without images (--images)"
     print(
-        f"{arguments.out}: {len(simulation.times)} images, {sum(map(len, simulation.boxes))} boxes of "
+        f"{arguments.out}: {len(simulation.times)} frames, {pictures}, {sum(map(len, simulation.boxes))} boxes of "
         f"{len(simulation.world)} objects, scenario {scenario}, seed {settings.seed} "
         f"({time.monotonic() - start:.1f} s)"
     )
