@@ -133,6 +133,16 @@ def read_detections(path: Path, camera: Camera) -> list[Boxes]:
     return [_boxes(stamp, rows[stamp], camera) for stamp in sorted(rows)]
 
 
+def read_class_names(path: Path) -> list[str]:
+    """Names of classes by their numbers, a line for each, from 0 on."""
+    names = [line.strip() for line in _text(path).splitlines()]
+    while names and not names[-1]:
+        names.pop()
+    if not names or not all(names):
+        raise TumError(f"{path}: must hold a name in each line, that of class 0 first")
+    return names
+
+
 def _boxes(stamp: int, rows: list[tuple[list[float], str, str]], camera: Camera) -> Boxes:
     numbers = np.array([row[0] for row in rows])
     return Boxes(

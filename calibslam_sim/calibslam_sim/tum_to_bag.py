@@ -9,6 +9,7 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +28,7 @@ from calibslam_sim.tum_folder import (
     TumError,
     preset_camera,
     read_camera,
+    read_class_names,
     read_detections,
     read_image_list,
     read_trajectory,
@@ -49,13 +51,16 @@ ORDER = (
 Item = tuple[int, str, Callable[[], Any]]
 
 
-def items(folder: Path, camera_name: str | None, detections: Path | None) -> tuple[list[Item], list[str]]:
+def items(
+    folder: Path, camera_name: str | None, detections: Path | None, class_names: Path | None = None
+) -> tuple[list[Item], list[str]]:
     """What the folder holds, in order of time, and notes for the user on what it does not hold.
 
     Args:
         folder: in TUM format.
         camera_name: a key of `PRESETS`; None: camera_info.yaml of the folder.
         detections: another file of boxes than detections.csv of the folder.
+        class_names: file with the names of the classes that the boxes have numbers of.
 
     Raises:
         TumError: naming the file, and what to do.
@@ -79,8 +84,11 @@ def items(folder: Path, camera_name: str | None, detections: Path | None) -> tup
         notes.append("no odometry.txt: no odometry; a back end needs relative motions from elsewhere")
     boxes_file = detections or folder / "detections.csv"
     if detections is not None or boxes_file.exists():
+        names = None if class_names is None else read_class_names(class_names)
         for boxes in read_detections(boxes_file, camera):
             image_stamps.add(boxes.stamp)
+            if names is not None:
+                boxes = replace(boxes, class_ids=tuple(_name(each, names, boxes_file) for each in boxes.class_ids))
             add(boxes.stamp, topics.DETECTIONS_WITHOUT_COVARIANCE, _boxes, boxes)
     else:
         notes.append("no detections.csv: no boxes; run a detector, or name a file with --detections")
@@ -118,6 +126,14 @@ def _camera(folder: Path, name: str | None) -> Camera:
         "does, with the keys image_width, image_height, camera_matrix, distortion_model (plumb_bob) and "
         "distortion_coefficients"
     )
+
+
+def _name(class_id: str, names: Sequence[str], boxes_file: Path) -> str:
+    if not class_id.isdecimal() or int(class_id) >= len(names):
+        raise TumError(
+            f"{boxes_file}: class {class_id} is not one of the {len(names)} of --class-names, which count from 0"
+        )
+    return names[int(class_id)]
 
 
 def _ready(message: Any) -> Any:
@@ -163,9 +179,10 @@ def convert(
     camera: str | None = None,
     detections: Path | None = None,
     overwrite: bool = False,
+    class_names: Path | None = None,
 ) -> tuple[dict[str, int], list[str]]:
     """Write the bag; returns the number of messages of each topic, and notes for the user."""
-    found, notes = items(folder, camera, detections)
+    found, notes = items(folder, camera, detections, class_names)
     counts: dict[str, int] = {}
     with bags.BagWriter(out, overwrite) as bag, Progress(len(found), f"writing {out}") as progress:
         for stamp, topic, make in found:
@@ -190,10 +207,21 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument(
         "--detections", type=Path, metavar="FILE", help="boxes (default: DIR/detections.csv where it exists)"
     )
+    parser.add_argument(
+        "--class-names",
+        type=Path,
+        metavar="FILE",
+        help="names instead of the numbers in class_id: a line for each class, from 0 on, as YOLO's coco.names",
+    )
     arguments = parser.parse_args(argv)
     try:
         counts, notes = convert(
-            arguments.folder, arguments.out, arguments.camera, arguments.detections, arguments.overwrite
+            arguments.folder,
+            arguments.out,
+            arguments.camera,
+            arguments.detections,
+            arguments.overwrite,
+            arguments.class_names,
         )
     except (TumError, bags.BagError) as error:
         print(f"tum_to_bag: {error}", file=sys.stderr)

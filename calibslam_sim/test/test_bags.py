@@ -90,6 +90,7 @@ def test_an_existing_bag_is_only_replaced_if_asked(bag: Path, capsys: pytest.Cap
     assert simulate.main(["--out", str(bag), *OPTIONS]) == 1
     assert "exists already" in capsys.readouterr().err
     assert simulate.main(["--out", str(bag), *OPTIONS, "--overwrite"]) == 0
+    assert " frames, without images (--images), " in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(
@@ -124,6 +125,24 @@ def folder(tmp_path: Path) -> Path:
     (path / "rgb.txt").write_text("1.0 rgb/1.png\n")
     (path / "depth.txt").write_text("1.0 depth/1.png\n")
     return path
+
+
+def test_numbers_of_classes_become_names(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    names = tmp_path / "coco.names"
+    names.write_text("\n".join(f"class {n}" for n in range(42)) + "\n\n")
+    arguments = [str(folder), "--out", str(tmp_path / "bag"), "--class-names", str(names)]
+    assert tum_to_bag.main(arguments) == 0
+    (boxes,) = (boxes_from_msg(m) for m in messages(tmp_path / "bag", topics.DETECTIONS_WITHOUT_COVARIANCE))
+    assert boxes.class_ids == ("class 41",)
+    for content, said in (
+        ("cup\nbook\n", "class 41 is not one of the 2 of --class-names"),
+        ("cup\n\nbook\n", "must hold a name in each line"),
+    ):
+        names.write_text(content)
+        assert tum_to_bag.main([*arguments, "--overwrite"]) == 1
+        assert said in capsys.readouterr().err
 
 
 def test_a_tum_folder_becomes_a_bag(folder: Path, tmp_path: Path) -> None:
