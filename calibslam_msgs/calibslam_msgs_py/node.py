@@ -60,6 +60,7 @@ QOS_OVERRIDES = QoSOverridingOptions(
 
 BAD_SETTINGS = 2  # exit code
 SECONDS_BETWEEN_WARNINGS = 5.0  # of one kind
+LONGEST_DELAY = 86_400 * SECOND  # [ns]; more is no delay, but the time of a recording against that of the clock
 SIGNAL_LATENCY = 0.1  # how long a waiting executor may not see a signal [s]
 
 
@@ -270,15 +271,16 @@ class _Input:
         self._delay = now - stamp
 
     def values(self) -> dict[str, str]:
-        """Rate since the last call [Hz], time since the last message [s], and how old that was when it came [s]."""
+        """Rate since the last call [Hz], time since the last message [s], and how old that was when it came [s], unless
+        stamp and clock are of two times.
+        """
         now = time.monotonic()
         rate = self._count / max(now - self._since, 1e-3)
         self._since, self._count = now, 0
-        return {
-            "hz": f"{rate:.1f}",
-            "age_s": f"{now - self._last:.2f}",
-            "delay_s": f"{self._delay / SECOND:.3f}",
-        }
+        values = {"hz": f"{rate:.1f}", "age_s": f"{now - self._last:.2f}"}
+        if abs(self._delay) < LONGEST_DELAY:
+            values["delay_s"] = f"{self._delay / SECOND:.3f}"
+        return values
 
 
 def advertise(node: Node, kind: Any, topic: str, profile: QoSProfile) -> Any:

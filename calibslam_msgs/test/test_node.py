@@ -150,12 +150,14 @@ def test_inputs_and_what_the_node_adds_reach_diagnostics(nodes: tuple[Node, Node
     counters.count("errors_journal")
     for _ in range(5):
         counters.arrived("detections", one.get_clock().now().nanoseconds - 2 * SECOND)
+        counters.arrived("replayed", 10**9 * SECOND)
     spin_until(executor, lambda: received)
     (status,) = received[0].status
     values = {v.key: v.value for v in status.values}
     assert values["memory_mb"] == "12" and values["rejected_nan"] == "3"
     assert float(values["detections_hz"]) > 0.0 and float(values["detections_age_s"]) >= 0.0
     assert 2.0 <= float(values["detections_delay_s"]) < 2.0 + PATIENCE
+    assert float(values["replayed_hz"]) > 0.0 and "replayed_delay_s" not in values
     assert (status.level, status.message) == (DiagnosticStatus.ERROR, "errors_journal, rejected_nan")
 
 
