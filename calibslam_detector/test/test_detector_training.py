@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import os
+import re
 import signal
 import threading
 from pathlib import Path
@@ -21,6 +22,7 @@ from calibslam_detector.model import weights_file
 from calibslam_detector.model.network import CalibratedDetector
 from calibslam_detector.model.region_cues import CUES
 from calibslam_detector.model.weights_file import WeightsError
+from calibslam_detector.training import training_loop
 from calibslam_detector.training.covariance_task import LOSSES, Examples, covariance_task
 from calibslam_detector.training.training_loop import LoopSettings, Task, TrainingError, batch_of, optimise
 
@@ -241,6 +243,23 @@ def test_the_weights_of_the_best_held_out_loss_are_kept(tmp_path: Path) -> None:
     torch.nn.init.zeros_(module.weight)
     optimise(task(), settings, tmp_path, {}, resume=True)
     assert float(module.weight.detach()) == seen[1]
+
+
+def test_without_a_terminal_lines_tell_how_far_it_is(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(training_loop, "SECONDS_BETWEEN_LINES", 0.0)
+    module = torch.nn.Linear(1, 1)
+    task = Task(
+        module,
+        list(module.parameters()),
+        lambda step: {"loss": (module.weight - 3.0).square().sum()},
+        torch.device("cpu"),
+    )
+    optimise(task, LoopSettings(steps=4, log_every=2), tmp_path, {}, resume=False)
+    first, second = capsys.readouterr().err.splitlines()
+    assert re.fullmatch(r"step 1 of 4: loss [\d.]+, 0\.\d min left", first)
+    assert second.startswith("step 3 of 4: loss ")
 
 
 def test_the_learning_rate_rises_and_falls() -> None:

@@ -8,6 +8,7 @@ from __future__ import annotations
 import csv
 import math
 import signal
+import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -26,6 +27,7 @@ from calibslam_msgs_py.settings import Settings, setting
 
 MAX_GRADIENT = 10.0  # norm to which a gradient is cut
 MAX_SKIPPED = 20  # steps without a finite loss in a row
+SECONDS_BETWEEN_LINES = 30.0  # where there is no terminal to show a bar on
 
 
 class TrainingError(RuntimeError):
@@ -101,6 +103,7 @@ def optimise(task: Task, settings: LoopSettings, folder: Path, identity: dict[st
     first = checkpoint.load() if resume else 0
     log = Log(folder / "log.csv", first) if task.is_first else None
     started, skipped = time.monotonic(), 0
+    told = started
     with (
         stop_flag() as stop,
         tqdm(total=settings.steps, initial=first, unit="step", disable=None if task.is_first else True) as progress,
@@ -134,6 +137,12 @@ def optimise(task: Task, settings: LoopSettings, folder: Path, identity: dict[st
                         best.offer(values["held_out"], task.module)
                     log.add(step, time.monotonic() - started, settings.rate(step), values)
                     progress.set_postfix(loss=f"{float(total.detach()):.4g}")
+                    now = time.monotonic()
+                    if progress.disable and now - told >= SECONDS_BETWEEN_LINES:
+                        told = now
+                        left = (now - started) / (step + 1 - first) * (settings.steps - step - 1)
+                        line = f"step {step + 1} of {settings.steps}: loss {float(total.detach()):.4g}"
+                        print(f"{line}, {left / 60.0:.1f} min left", file=sys.stderr, flush=True)
             progress.update()
             done = step + 1
             stopped = not task.everywhere(not stop())
