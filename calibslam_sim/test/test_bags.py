@@ -127,9 +127,7 @@ def folder(tmp_path: Path) -> Path:
     return path
 
 
-def test_numbers_of_classes_become_names(
-    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_numbers_of_classes_become_names(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     names = tmp_path / "coco.names"
     names.write_text("\n".join(f"class {n}" for n in range(42)) + "\n\n")
     arguments = [str(folder), "--out", str(tmp_path / "bag"), "--class-names", str(names)]
