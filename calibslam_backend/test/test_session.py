@@ -19,8 +19,8 @@ import pytest
 from small_world import CAMERA, SmallWorld, around, objects
 
 from calibslam_backend.estimator import EstimatorSettings
-from calibslam_backend.output.metrics import Trajectory, ate
 from calibslam_backend.graph.known import NOTHING_KNOWN
+from calibslam_backend.output.metrics import Trajectory, ate
 from calibslam_backend.output.object_map import ObjectMap
 from calibslam_backend.ros.diagnostics import state
 from calibslam_backend.ros.map_services_node import MapServices
