@@ -235,7 +235,7 @@ def test_the_weights_of_the_best_held_out_loss_are_kept(tmp_path: Path) -> None:
             held_out=held_out,
         )
 
-    settings = LoopSettings(steps=4, checkpoint_every=1, log_every=1, warm_up=0, learning_rate=0.1)
+    settings = LoopSettings(steps=4, checkpoint_every=1, log_every=1, evaluate_every=1, warm_up=0, learning_rate=0.1)
     optimise(task(), settings, tmp_path, {}, resume=False)
     assert len(set(seen)) == 4 and float(module.weight.detach()) == seen[1]
     assert [row["held_out"] for row in rows(tmp_path)] == ["3", "1", "2", "4"]
@@ -260,6 +260,28 @@ def test_without_a_terminal_lines_tell_how_far_it_is(
     first, second = capsys.readouterr().err.splitlines()
     assert re.fullmatch(r"step 1 of 4: loss [\d.]+, 0\.\d min left", first)
     assert second.startswith("step 3 of 4: loss ")
+
+
+@pytest.mark.parametrize("log_every", [1, 3, 1000])
+@pytest.mark.parametrize(("last", "kept"), [(2.0, 2), (0.5, 5)])
+def test_what_is_logged_does_not_decide_which_weights_are_kept(
+    log_every: int, last: float, kept: int, tmp_path: Path
+) -> None:
+    """Every second step counts, and the last one; those between, which are logged or not, are better and do not."""
+    module = torch.nn.Linear(1, 1, bias=False)
+    held_out = [5.0, 0.0, 1.0, 0.0, 3.0, last]
+    after: list[float] = []  # weight after each step but the last
+
+    def losses(step: int) -> dict[str, torch.Tensor]:
+        if step:
+            after.append(float(module.weight.detach()))
+        return {"loss": module.weight.sum()}
+
+    task = Task(module, list(module.parameters()), losses, torch.device("cpu"), held_out=lambda: held_out[len(after)])
+    settings = LoopSettings(steps=6, log_every=log_every, evaluate_every=2, warm_up=0, learning_rate=0.1)
+    optimise(task, settings, tmp_path, {}, resume=False)
+    after.append(float(weights_file.read(tmp_path / "checkpoint.pt", "checkpoint")["module"]["weight"]))
+    assert float(module.weight.detach()) == after[kept] and len(set(after)) == 6
 
 
 def test_the_learning_rate_rises_and_falls() -> None:

@@ -48,6 +48,9 @@ class LoopSettings(Settings):
     warm_up: int = setting(100, "steps over which the learning rate rises", low=0)
     checkpoint_every: int = setting(200, "steps between two checkpoints", low=1)
     log_every: int = setting(10, "steps between two lines of the log", low=1)
+    evaluate_every: int = setting(
+        20, "steps between two evaluations on held-out samples, which decide the weights that are kept", low=1
+    )
     seed: int = setting(0, "the same seed gives the same training on the same machine", low=0)
     amp: bool = setting(True, "mixed precision, where there is CUDA")
 
@@ -65,10 +68,10 @@ class Task:
         module: whose weights and numbers a checkpoint holds.
         parameters: that are changed.
         losses: names and values at a step; their sum is made smaller. None: nothing to learn from this step.
-        finite_everywhere: whether a loss that is finite here is so in all processes.
+        everywhere: whether what is so here is so in all processes, e.g. that a loss is finite.
         is_first: whether this process writes files and shows progress.
-        held_out: a loss on samples that are not learnt from; measured with each line of the log, and in the end the
-            weights are those of the least one. None: the last weights.
+        held_out: a loss on samples that are not learnt from. It is told with each line of the log, and in the end the
+            weights are those of the least one of all evaluations. None: the last weights.
     """
 
     module: nn.Module
@@ -130,11 +133,16 @@ def optimise(task: Task, settings: LoopSettings, folder: Path, identity: dict[st
                 nn.utils.clip_grad_norm_(task.parameters, MAX_GRADIENT)
                 scaler.step(optimiser)
                 scaler.update()
-                if log is not None and losses is not None and step % settings.log_every == 0:
+                is_logged = log is not None and step % settings.log_every == 0
+                is_evaluated = step % settings.evaluate_every == 0
+                held_out = task.held_out() if task.held_out is not None and (is_logged or is_evaluated) else None
+                # What is logged must not decide which weights are kept.
+                if held_out is not None and is_evaluated:
+                    best.offer(held_out, task.module)
+                if is_logged and log is not None and losses is not None:
                     values = {name: float(value.detach()) for name, value in losses.items()}
-                    if task.held_out is not None:
-                        values["held_out"] = task.held_out()
-                        best.offer(values["held_out"], task.module)
+                    if held_out is not None:
+                        values["held_out"] = held_out
                     log.add(step, time.monotonic() - started, settings.rate(step), values)
                     progress.set_postfix(loss=f"{float(total.detach()):.4g}")
                     now = time.monotonic()
@@ -152,6 +160,8 @@ def optimise(task: Task, settings: LoopSettings, folder: Path, identity: dict[st
                     plot_curves(log.path, folder / "curves.png")
             if stopped and done < settings.steps:
                 raise Interrupted(f"stopped after step {done} of {settings.steps}; go on with --resume")
+    if task.held_out is not None:
+        best.offer(task.held_out(), task.module)
     best.restore(task.module)
 
 
