@@ -31,6 +31,10 @@ from calibslam_msgs_py.settings import Settings, add_arguments, from_arguments, 
 
 MIN_EXAMPLES = 500  # of the covariance head; a fifth of them are held out, and two sums of f-Cal need 50
 INTERRUPTED = 130  # exit code, as of a process that SIGINT ended
+CHECKPOINT, EXAMPLES = "checkpoint.pt", "examples.pt"
+# What a run may have written that ended before its first checkpoint: nothing that is lost if it begins again.
+BEGUN = {"settings.json", "log.csv", "curves.png", EXAMPLES, f".{EXAMPLES}.part", f".{CHECKPOINT}.part"}
+DIGITS = 12  # of a checksum that are told
 
 
 @dataclass(frozen=True)
@@ -92,7 +96,7 @@ def _train_detector(arguments: argparse.Namespace, settings: TrainSettings, loop
             _tell(data)
         skipped: Counter[str] = Counter()
         task = detector_task(model, data, settings.batch, settings.workers, loop, processes, skipped)
-        optimise(task, loop, arguments.out, _identity(settings, loop, data), arguments.resume)
+        optimise(task, loop, arguments.out, _identity(settings, loop, data, _annotations(data)), arguments.resume)
         if processes.rank == 0:
             _finish(arguments.out, model, skipped)
     finally:
@@ -104,25 +108,35 @@ def _train_covariance(arguments: argparse.Namespace, settings: TrainSettings, lo
         raise TrainingError("stage covariance needs a trained detector: --weights FILE or --coco-weights FILE")
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
     model, data = _begin(arguments, settings)
+    origin = {"detector": weights_file.checksum_of_weights(model.detector)[:DIGITS], **_annotations(data)}
     _open_run(arguments.out, arguments.resume, settings, loop)
     _tell(data)
     skipped: Counter[str] = Counter()
-    examples = stored_examples(arguments.out / "examples.pt", lambda: find_examples(model, data, device, skipped))
+    examples = stored_examples(
+        arguments.out / EXAMPLES,
+        {**origin, "boxes": settings.boxes, "images": len(data.images)},
+        lambda: find_examples(model, data, device, skipped),
+    )
     if len(examples) < MIN_EXAMPLES:
         raise TrainingError(f"only {len(examples)} boxes were found again by the detector; {MIN_EXAMPLES} are needed")
     print(f"{len(examples)} boxes found again, {int(examples.whole.sum())} of them of objects wholly in the image")
     model.familiarity.fit(examples.descriptors.to(device))
     torch.manual_seed(loop.seed)
     task = covariance_task(model, examples, settings.loss, settings.regions, loop, device)
-    optimise(task, loop, arguments.out, _identity(settings, loop, data), arguments.resume)
+    optimise(task, loop, arguments.out, _identity(settings, loop, data, origin), arguments.resume)
     _finish(arguments.out, model, skipped)
 
 
-def _identity(settings: TrainSettings, loop: LoopSettings, data: CocoData) -> dict[str, Any]:
-    """What must stay the same for a training to be gone on with."""
+def _identity(settings: TrainSettings, loop: LoopSettings, data: CocoData, origin: dict[str, str]) -> dict[str, Any]:
+    """What must stay the same for a training to be gone on with; `origin`: checksums of what it begins with."""
     content = {**asdict(settings), "steps": loop.steps, "seed": loop.seed}
     del content["workers"]
-    return {**content, "images": len(data.images), "classes": list(data.class_names)}
+    checksums = {f"checksum of the {name}": value for name, value in origin.items()}
+    return {**content, "images": len(data.images), "classes": list(data.class_names), **checksums}
+
+
+def _annotations(data: CocoData) -> dict[str, str]:
+    return {"annotations": weights_file.checksum(data.annotations)[:DIGITS]}
 
 
 def _finish(folder: Path, model: CalibratedDetector, skipped: Counter[str]) -> None:
@@ -162,9 +176,11 @@ def _begin(arguments: argparse.Namespace, settings: TrainSettings) -> tuple[Cali
 
 def _open_run(folder: Path, resume: bool, settings: TrainSettings, loop: LoopSettings) -> None:
     """Make the run folder, and write down what is done."""
-    if not resume and folder.exists() and any(folder.iterdir()):
-        raise TrainingError(f"{folder} exists already: go on with --resume, or choose another folder")
-    if resume and not (folder / "checkpoint.pt").exists():
+    there = {path.name for path in folder.iterdir()} if folder.exists() else set()
+    if not resume and there - BEGUN:
+        way_out = "go on with --resume, or choose another folder" if CHECKPOINT in there else "choose another folder"
+        raise TrainingError(f"{folder} exists already: {way_out}")
+    if resume and CHECKPOINT not in there:
         raise TrainingError(f"{folder} has no checkpoint to resume; leave --resume out")
     folder.mkdir(parents=True, exist_ok=True)
     content: dict[str, Any] = {**asdict(settings), **asdict(loop), "torch": torch.__version__}

@@ -8,6 +8,7 @@ import os
 import re
 import signal
 import threading
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -197,7 +198,7 @@ def test_a_corrupt_image_is_left_out_and_counted(tmp_path: Path, capsys: pytest.
 def test_a_run_folder_is_not_overwritten(data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "mine.txt").touch()
     assert train.main([str(data), "--out", str(tmp_path)]) == 1
-    assert "exists already" in capsys.readouterr().err
+    assert "exists already: choose another folder" in capsys.readouterr().err
     assert train.main([str(data), "--out", str(tmp_path), "--resume"]) == 1
     assert "no checkpoint" in capsys.readouterr().err
 
@@ -211,10 +212,15 @@ def test_a_loss_that_is_not_finite_ends_training_with_the_last_good_state(tmp_pa
         lambda step: {"loss": losses[step] * module.weight.square().sum()},
         torch.device("cpu"),
     )
-    with pytest.raises(TrainingError, match="no finite loss in 20 steps"):
+    with pytest.raises(TrainingError, match=r"no finite loss in 20 steps .* \(--resume\)"):
         optimise(task, LoopSettings(steps=60, checkpoint_every=1, log_every=1), tmp_path, {}, resume=False)
     assert torch.isfinite(module.weight).all()
     assert len(rows(tmp_path)) == 3
+    # Where there is none, nobody is sent to it.
+    losses = dict.fromkeys(losses, float("nan"))
+    (tmp_path / "checkpoint.pt").unlink()
+    with pytest.raises(TrainingError, match="; begin again with a smaller --learning-rate"):
+        optimise(task, LoopSettings(steps=60), tmp_path, {}, resume=False)
 
 
 def test_the_weights_of_the_best_held_out_loss_are_kept(tmp_path: Path) -> None:
@@ -351,6 +357,74 @@ def test_both_stages_and_evaluation(data: Path, tmp_path: Path, monkeypatch: pyt
     assert evaluate_detector.main([str(data), *arguments]) == 0
     result = json.loads((tmp_path / "evaluation" / "metrics.json").read_text())
     assert result["images"] == 4 and 0.0 <= result["map"] <= 1.0
+
+
+def of_whole_objects(every: int) -> Examples:
+    """1000 examples, of which every n-th is of an object wholly in the image."""
+    return replace(examples(1000)[0], whole=torch.arange(1000) % every == 0)
+
+
+@pytest.mark.parametrize(
+    ("every", "batch", "says"),
+    [
+        (5, 512, "only 40 of the boxes held out are .*, --loss f_cal_cramer needs 50"),
+        (2, 64, "of the 64 boxes of a step 32 are .*, --loss f_cal_cramer needs 50: give more --regions"),
+    ],
+)
+def test_too_few_whole_objects_for_f_cal_are_said(every: int, batch: int, says: str) -> None:
+    model, few = CalibratedDetector("compact", ("cup", "book")), of_whole_objects(every)
+    with pytest.raises(TrainingError, match=says):
+        covariance_task(model, few, "f_cal_cramer", batch, LoopSettings(), torch.device("cpu"))
+    assert covariance_task(model, few, "nll", batch, LoopSettings(), torch.device("cpu")).losses(0) is not None
+
+
+def test_a_step_that_has_too_few_whole_objects_by_chance_is_left_out() -> None:
+    """Half of 100 on average, and 50 are needed: about half of the steps have fewer."""
+    model, half = CalibratedDetector("compact", ("cup", "book")), of_whole_objects(2)
+    task = covariance_task(model, half, "f_cal_cramer", 100, LoopSettings(), torch.device("cpu"))
+    left_out = sum(task.losses(step) is None for step in range(40))
+    assert 5 < left_out < 35
+
+
+@pytest.mark.parametrize("changed", ["weights", "annotations"])
+def test_neither_another_detector_nor_other_annotations_are_gone_on_with(
+    changed: str, data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("calibslam_detector.training.matching.MIN_OVERLAP", 0.02)
+    monkeypatch.setattr(train, "MIN_EXAMPLES", 2)
+    torch.manual_seed(1)
+    weights_file.save(CalibratedDetector("compact", tuple(COLOURS)), tmp_path / "begin.pt")
+    (tmp_path / "annotations.json").write_bytes((data / "annotations.json").read_bytes())
+    options = [str(data), "--annotations", str(tmp_path / "annotations.json"), "--stage", "covariance"]
+    options += ["--weights", str(tmp_path / "begin.pt"), "--loss", "nll", "--steps", "2"]
+    assert train.main([*options, "--out", str(tmp_path / "run")]) == 0
+    if changed == "weights":
+        weights_file.save(CalibratedDetector("compact", tuple(COLOURS)), tmp_path / "begin.pt")
+    else:
+        content = json.loads((tmp_path / "annotations.json").read_text())
+        content["annotations"][0]["bbox"][0] += 3
+        (tmp_path / "annotations.json").write_text(json.dumps(content))
+    thing = "detector" if changed == "weights" else "annotations"
+    assert train.main([*options, "--out", str(tmp_path / "run"), "--resume"]) == 1
+    said = capsys.readouterr().err
+    assert "examples.pt holds boxes found with other options" in said and f"{thing} " in said
+    # The checkpoint knows it, too.
+    (tmp_path / "run" / "examples.pt").unlink()
+    assert train.main([*options, "--out", str(tmp_path / "run"), "--resume"]) == 1
+    assert f"is of a training with checksum of the {thing} = " in capsys.readouterr().err
+
+
+def test_a_run_that_failed_before_its_first_checkpoint_begins_again(
+    data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("calibslam_detector.training.matching.MIN_OVERLAP", 0.02)
+    weights_file.save(CalibratedDetector("compact", tuple(COLOURS)), tmp_path / "begin.pt")
+    options = [str(data), "--stage", "covariance", "--weights", str(tmp_path / "begin.pt"), "--loss", "nll"]
+    options += ["--steps", "1", "--out", str(tmp_path / "run")]
+    assert train.main(options) == 1  # too few boxes
+    assert (tmp_path / "run" / "examples.pt").exists()
+    monkeypatch.setattr(train, "MIN_EXAMPLES", 2)
+    assert train.main(options) == 0
 
 
 def test_stage_covariance_needs_a_detector(data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -60,7 +60,7 @@ def save_head(model: CalibratedDetector, path: Path) -> None:
     content = {
         "format": HEAD_FORMAT,
         "version": HEAD_VERSION,
-        "detector": _checksum(SHIPPED),
+        "detector": checksum(SHIPPED),
         "weights": {name: _halved(weight) for name, weight in model.covariance_head.state_dict().items()},
     }
     write_safely(content, path)
@@ -101,7 +101,7 @@ def load(path: Path = SHIPPED) -> CalibratedDetector:
 
 
 def _shipped_with_head(content: dict[str, Any], path: Path) -> CalibratedDetector:
-    if content.get("version") != HEAD_VERSION or content.get("detector") != _checksum(SHIPPED):
+    if content.get("version") != HEAD_VERSION or content.get("detector") != checksum(SHIPPED):
         raise WeightsError(f"{path} is a covariance head of another release's detector; train it again")
     model = load(SHIPPED)
     _fill(model.covariance_head, content.get("weights"), path, "the covariance head of the shipped detector")
@@ -158,8 +158,18 @@ def _fill(module: torch.nn.Module, weights: Any, path: Path, architecture: str) 
         raise WeightsError(f"{path} holds NaN or infinity in {bad[0]}: its training has failed")
 
 
-def _checksum(path: Path) -> str:
+def checksum(path: Path) -> str:
+    """Of what is in a file."""
     return hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+def checksum_of_weights(module: torch.nn.Module) -> str:
+    """Of all weights and numbers of a module, whatever device they are on."""
+    digest = hashlib.sha256()
+    for name, value in module.state_dict().items():
+        digest.update(f"{name} {value.dtype} {tuple(value.shape)}\n".encode())
+        digest.update(value.detach().cpu().contiguous().numpy().tobytes())
+    return digest.hexdigest()
 
 
 def _halved(weight: Tensor) -> Tensor:

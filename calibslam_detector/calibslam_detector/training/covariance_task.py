@@ -10,6 +10,7 @@ from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -24,7 +25,7 @@ from calibslam_detector.model import weights_file
 from calibslam_detector.model.box_covariance import decoupled
 from calibslam_detector.model.network import CalibratedDetector, Regions
 from calibslam_detector.training.matching import free_of_border, match
-from calibslam_detector.training.training_loop import LoopSettings, Task, batch_of
+from calibslam_detector.training.training_loop import LoopSettings, Task, TrainingError, batch_of
 
 # Each is the likelihood and, with a weight, a demand for calibration (eq. 4.2.6). The weights put both on one scale:
 # the squared Wasserstein distance is in squared units of a sum of K squares, that of Cramer and von Mises is below 1/3.
@@ -37,6 +38,8 @@ LOSSES: dict[str, tuple[Callable[[], torch.nn.Module] | None, float]] = {
     "calibration": (CalibrationLoss, 0.5),
 }
 
+# Boxes of whole objects that a demand for calibration must see at once: two of f-Cal's sums, 25 boxes of four each.
+MIN_WHOLE = 50
 HELD_OUT = 0.2  # share of the examples, those of the last images, that decide which weights are kept
 
 
@@ -113,6 +116,9 @@ def covariance_task(
 
     The weights of the least loss of held-out examples are kept: a head of so many weights soon knows its examples
     by heart, and then claims too much of others.
+
+    Raises:
+        TrainingError: too few of the examples, or of those of a step, are of whole objects for this loss.
     """
     model.to(device).eval().requires_grad_(False)
     head = model.covariance_head.train().requires_grad_(True)
@@ -121,6 +127,9 @@ def covariance_task(
     calibration = make() if make is not None else None
 
     learnt = len(examples) - round(HELD_OUT * len(examples))
+    batch = min(batch, learnt)
+    if calibration is not None:
+        _check_whole(examples.whole, learnt, batch, loss)
 
     def evaluate(chosen: Tensor) -> dict[str, Tensor]:
         """Both terms of eq. 4.2.6, of residuals that are independent of each other."""
@@ -137,8 +146,12 @@ def covariance_task(
             found["calibration"] = weight * calibration(zero[whole], variances[whole], independent[whole])
         return found
 
-    def losses(step: int) -> dict[str, Tensor]:
-        return evaluate(torch.from_numpy(batch_of(step, min(batch, learnt), learnt, settings.seed)))
+    def losses(step: int) -> dict[str, Tensor] | None:
+        chosen = torch.from_numpy(batch_of(step, batch, learnt, settings.seed))
+        # By chance a batch may have fewer than most of them.
+        if calibration is not None and int(examples.whole[chosen].sum()) < MIN_WHOLE:
+            return None
+        return evaluate(chosen)
 
     @torch.no_grad()
     def held_out() -> float:
@@ -152,8 +165,45 @@ def covariance_task(
     return Task(head, list(head.parameters()), losses, device, held_out=held_out)
 
 
-def stored_examples(path: Path, make: Callable[[], Examples]) -> Examples:
-    """The examples of a file, made and written where there is none: what a resumed training goes on with."""
+def _check_whole(whole: Tensor, learnt: int, batch: int, loss: str) -> None:
+    """Whether examples (M,), of which the first `learnt` are learnt from, and steps have enough of whole objects."""
+    needs = f"--loss {loss} needs {MIN_WHOLE}"
+    held_out = int(whole[learnt:].sum())
+    if held_out < MIN_WHOLE:
+        raise TrainingError(
+            f"only {held_out} of the boxes held out are of objects wholly in the image, {needs}: give more images, or "
+            "take --loss nll"
+        )
+    of_step = batch * float(whole[:learnt].double().mean())
+    if of_step < MIN_WHOLE:
+        raise TrainingError(
+            f"of the {batch} boxes of a step {of_step:.0f} are of objects wholly in the image, {needs}: give more "
+            "--regions (and images, if there are no more boxes), or take --loss nll"
+        )
+
+
+def stored_examples(path: Path, origin: dict[str, Any], make: Callable[[], Examples]) -> Examples:
+    """The examples of a file, made and written where there is none: what a resumed training goes on with.
+
+    Args:
+        path: the file.
+        origin: what they are made of, and must have been made of.
+        make: finds them.
+
+    Raises:
+        WeightsError: the file cannot be read.
+        TrainingError: it holds examples of something else.
+    """
     if not path.exists():
-        weights_file.write_safely(vars(make()), path)
-    return Examples(**weights_file.read(path, "examples"))
+        weights_file.write_safely({"origin": origin, **vars(make())}, path)
+    content = weights_file.read(path, "examples")
+    found = content.pop("origin", {})
+    differing = [
+        f"{name} {found.get(name)} there, {value} now" for name, value in origin.items() if found.get(name) != value
+    ]
+    if differing:
+        raise TrainingError(
+            f"{path} holds boxes found with other options ({'; '.join(differing)}); go on with the same ones, or begin "
+            "in another folder"
+        )
+    return Examples(**content)

@@ -122,9 +122,10 @@ def optimise(task: Task, settings: LoopSettings, folder: Path, identity: dict[st
                 skipped += 1
                 progress.set_postfix_str(f"{skipped} steps without a finite loss")
                 if skipped >= MAX_SKIPPED:
+                    way_out = f"go on from {checkpoint.path} (--resume)" if checkpoint.path.exists() else "begin again"
                     raise TrainingError(
-                        f"no finite loss in {MAX_SKIPPED} steps up to step {step}; the last good state is in "
-                        f"{folder / 'checkpoint.pt'}: go on from there (--resume) with a smaller --learning-rate"
+                        f"no finite loss in {MAX_SKIPPED} steps up to step {step}; {way_out} with a smaller "
+                        "--learning-rate"
                     )
             else:
                 skipped = 0
