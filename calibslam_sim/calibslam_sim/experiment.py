@@ -1,7 +1,8 @@
 """`experiment NAME --out DIR`: one of the document's experiments, with table, JSON, CSV and figure.
 
 Conditions are compared on the same worlds and noise. Interrupt it as you like: the same command goes on where it
-stopped, unless the code has changed. The same command gives the same numbers, whatever the number of processes.
+stopped, unless the code or a file it is computed from has changed. The same command gives the same numbers, whatever
+the number of processes.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ from calibslam_msgs_py.command import command
 from calibslam_msgs_py.settings import SettingsError, add_arguments, from_arguments
 from calibslam_sim.experiments.design import Experiment, ExperimentError, ExperimentSettings
 from calibslam_sim.experiments.engine import run
-from calibslam_sim.experiments.fingerprint import fingerprint
+from calibslam_sim.experiments.fingerprint import file_hashes, fingerprint
 from calibslam_sim.experiments.outputs import result_of, table, write
 from calibslam_sim.experiments.registry import MODULES, load
 from calibslam_sim.experiments.run_store import RunStore
@@ -41,7 +42,7 @@ def perform(
     experiment = load(name)
     conditions = experiment.conditions(settings)
     code = fingerprint()
-    store = RunStore(out, name, settings, code, overwrite)
+    store = RunStore(out, name, settings, code, file_hashes(experiment.inputs(settings)), overwrite)
     wanted = store.missing(conditions, repetitions)
     with Progress(len(wanted), name) as progress:
         for repetition in run(name, settings, wanted, jobs, backend):

@@ -6,6 +6,7 @@ import csv
 import json
 import math
 import re
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -211,9 +212,9 @@ def test_other_settings_are_refused(tmp_path: Path, capsys: pytest.CaptureFixtur
 
 
 def test_another_experiment_is_refused(tmp_path: Path) -> None:
-    RunStore(tmp_path, "toy", KalmanSettings(), CODE)
+    RunStore(tmp_path, "toy", KalmanSettings(), CODE, {})
     with pytest.raises(ExperimentError, match="holds the experiment toy"):
-        RunStore(tmp_path, "kalman", KalmanSettings(), CODE)
+        RunStore(tmp_path, "kalman", KalmanSettings(), CODE, {})
 
 
 def test_what_other_code_has_computed_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -226,6 +227,24 @@ def test_what_other_code_has_computed_is_refused(tmp_path: Path, capsys: pytest.
         said = capsys.readouterr().err
         assert f"{before.get('code', 'unknown')} there, {header['code']} now" in said and "--overwrite" in said
     assert call(tmp_path, "--jobs", "1", "--overwrite")["code"] == header["code"]
+
+
+def test_what_was_computed_from_other_files_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The same path does not make it the same file."""
+    file = tmp_path / "weights.pt"
+    file.write_bytes(b"old")
+    monkeypatch.setattr(kalman, "EXPERIMENT", replace(kalman.EXPERIMENT, inputs=lambda settings: {"weights": file}))
+    out = tmp_path / "out"
+    done = numbers(call(out, "--jobs", "1"))
+    assert json.loads((out / SETTINGS).read_text())["inputs"] == fingerprint.file_hashes({"weights": file})
+    file.write_bytes(b"new")
+    assert experiment.main([*QUICK, "--out", str(out), "--jobs", "1"]) == 1
+    said = capsys.readouterr().err
+    assert "files that are others now, by their content (weights)" in said and "--overwrite" in said
+    file.write_bytes(b"old")
+    assert numbers(call(out, "--jobs", "1")) == done
 
 
 def test_the_fingerprint_tells_sources_apart(tmp_path: Path) -> None:
@@ -244,17 +263,17 @@ def test_the_fingerprint_tells_sources_apart(tmp_path: Path) -> None:
 def test_a_folder_that_is_none_of_ours_is_refused(tmp_path: Path) -> None:
     (tmp_path / SETTINGS).write_text("[1, 2]")
     with pytest.raises(ExperimentError, match="not of an experiment"):
-        RunStore(tmp_path, "kalman", KalmanSettings(), CODE)
+        RunStore(tmp_path, "kalman", KalmanSettings(), CODE, {})
 
 
 def test_a_bad_line_is_named(tmp_path: Path) -> None:
-    RunStore(tmp_path, "kalman", KalmanSettings(), CODE).add(Repetition("calibrated", 0, {"mse": math.nan}, 0.1))
-    store = RunStore(tmp_path, "kalman", KalmanSettings(), CODE)
+    RunStore(tmp_path, "kalman", KalmanSettings(), CODE, {}).add(Repetition("calibrated", 0, {"mse": math.nan}, 0.1))
+    store = RunStore(tmp_path, "kalman", KalmanSettings(), CODE, {})
     assert math.isnan(store.values(["calibrated"], 1)["calibrated"]["mse"][0])
     with (tmp_path / REPETITIONS).open("a") as file:
         file.write("nonsense\n")
     with pytest.raises(ExperimentError, match=f"{REPETITIONS}:2"):
-        RunStore(tmp_path, "kalman", KalmanSettings(), CODE)
+        RunStore(tmp_path, "kalman", KalmanSettings(), CODE, {})
 
 
 def test_what_is_wrong_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

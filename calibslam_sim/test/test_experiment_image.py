@@ -12,6 +12,7 @@ import torch
 from calibslam_detector.model import weights_file
 from calibslam_detector.model.detector import Detector, DetectorSettings
 from calibslam_detector.model.network import CalibratedDetector
+from calibslam_detector.model.weights_file import SHIPPED, SHIPPED_NLL_HEAD
 from calibslam_sim import experiment
 from calibslam_sim.experiments import engine, image
 from calibslam_sim.experiments.covariance_heads import CovarianceHeads
@@ -79,6 +80,13 @@ def test_without_a_second_detector_there_is_no_condition_for_it(files: dict[str,
     assert image.conditions(alone) == ["calibrated", "fixed", "quadricslam"]
     both = image.ImageSettings(weights=str(files["calibrated"]), nll_weights=str(files["nll"]))
     assert image.comparisons(both) == [("calibrated", name) for name in ("nll", "fixed", "quadricslam")]
+
+
+def test_the_files_it_is_computed_from_are_known(files: dict[str, Path]) -> None:
+    """The shipped ones, too."""
+    assert set(image.inputs(image.ImageSettings()).values()) == {SHIPPED, SHIPPED_NLL_HEAD}
+    one = image.ImageSettings(nll_weights=str(files["nll"]))
+    assert image.inputs(one) == {"weights of calibrated": SHIPPED, "weights of nll": files["nll"]}
 
 
 def test_the_command(files: dict[str, Path], tmp_path: Path) -> None:

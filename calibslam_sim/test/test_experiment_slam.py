@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import io
 import json
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import gtsam
 import numpy as np
@@ -229,6 +231,23 @@ def test_tum_command(folder: Path, tmp_path: Path) -> None:
         assert 0.0 < metrics["ate_m"]["mean"] < 0.5
     assert tum.document(result["settings"])["fixed"]["ate_m"] == (0.429, 0.117)
     assert tum.document({"folder": "somewhere/fr1_desk"}) == {}
+
+
+def test_tum_names_every_file_that_it_reads(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "calibrator.json").write_text('{"version": 1, "kind": "per_size"}')
+    settings = tum.TumSettings(folder=str(folder), calibrator=str(tmp_path / "calibrator.json"), most_images=10)
+    read = set()
+    plainly = io.open
+
+    def noted(file: Any, *args: Any, **kwargs: Any) -> Any:
+        read.add(Path(file))
+        return plainly(file, *args, **kwargs)
+
+    monkeypatch.setattr(io, "open", noted)
+    monkeypatch.setattr("builtins.open", noted)
+    tum.recorded.cache_clear()
+    tum.recorded(settings)
+    assert {path for path in read if path.parent in (folder, tmp_path)} == set(tum.inputs(settings).values())
 
 
 def test_tum_noise_has_its_size(folder: Path) -> None:

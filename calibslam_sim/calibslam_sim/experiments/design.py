@@ -66,6 +66,7 @@ class Experiment:
         comparisons: pairs (A, B) of conditions to be tested against each other.
         figure: draws a result (the content of result.json) into a PNG.
         degrees_of_freedom: of each metric that is a normalised squared error of independent repetitions.
+        inputs: settings -> name and path of each file that repetitions are computed from.
         document: settings -> mean and deviation in the document, of condition and metric; a deviation of None: it
             states none.
         left_out: settings, condition -> share of one recording that each of its repetitions leaves out; 0: they are
@@ -85,6 +86,7 @@ class Experiment:
     comparisons: Callable[[Any], Sequence[tuple[str, str]]]
     figure: Callable[[dict[str, Any], Path], None]
     degrees_of_freedom: Mapping[str, int] = field(default_factory=dict)
+    inputs: Callable[[Any], Mapping[str, Path]] = lambda settings: {}
     document: Callable[[Any], DocumentNumbers] = lambda settings: {}
     left_out: Callable[[Any, str], float] = lambda settings, condition: 0.0
     further: Callable[[Mapping[str, Mapping[str, Sequence[float]]]], dict[str, Any]] = lambda values: {}

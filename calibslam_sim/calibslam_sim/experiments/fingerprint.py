@@ -1,9 +1,9 @@
-"""Which state of the code made a result: repetitions of two states do not belong into one table."""
+"""Which state of the code, and which files, made a result: repetitions of two states do not belong into one table."""
 
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from importlib import import_module
 from importlib.metadata import version
 from pathlib import Path
@@ -27,3 +27,8 @@ def sources_hash(folders: Iterable[tuple[str, Path]]) -> str:
             digest.update(f"{name}/{path.relative_to(folder).as_posix()} {len(content)}\n".encode())
             digest.update(content)
     return digest.hexdigest()[:DIGITS]
+
+
+def file_hashes(files: Mapping[str, Path]) -> dict[str, str]:
+    """Hash of the content of each of some named files."""
+    return {name: hashlib.sha256(path.read_bytes()).hexdigest()[:DIGITS] for name, path in files.items()}

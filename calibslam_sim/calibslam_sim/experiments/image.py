@@ -127,6 +127,12 @@ def conditions(settings: ImageSettings) -> list[str]:
     return [name for name, (head, _) in NOISE.items() if head in there]
 
 
+def inputs(settings: ImageSettings) -> dict[str, Path]:
+    """The detectors' files, also those that are shipped."""
+    there = files(settings.weights, settings.nll_weights)
+    return {f"weights of {head}": path for head, path in there.items()}
+
+
 def comparisons(settings: ImageSettings) -> list[tuple[str, str]]:
     """f-Cal against all others."""
     return [(CALIBRATED, name) for name in conditions(settings) if name != CALIBRATED]
@@ -148,5 +154,6 @@ EXPERIMENT = Experiment(
     run=run,
     comparisons=comparisons,
     figure=figure,
+    inputs=inputs,
     is_shared=True,
 )

@@ -1,4 +1,5 @@
-"""The folder of an experiment: its settings, the state of the code, and a line for each repetition that is done.
+"""The folder of an experiment: its settings, the state of the code and of the files it is computed from, and a line for
+each repetition that is done.
 
 An interrupted experiment finds there what it need not do again.
 """
@@ -7,7 +8,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -31,7 +32,13 @@ class RunStore:
     """What is done of an experiment, in a folder."""
 
     def __init__(
-        self, folder: Path, name: str, settings: ExperimentSettings, code: str, overwrite: bool = False
+        self,
+        folder: Path,
+        name: str,
+        settings: ExperimentSettings,
+        code: str,
+        inputs: Mapping[str, str],
+        overwrite: bool = False,
     ) -> None:
         """Begin in a new folder, or go on in one.
 
@@ -40,15 +47,17 @@ class RunStore:
             name: of the experiment.
             settings: of the experiment.
             code: which state of the code is running, see `fingerprint`.
+            inputs: hash of each file that is computed from, by its name.
             overwrite: begin anew.
 
         Raises:
-            ExperimentError: the folder holds another experiment, other settings, or what other code has computed.
+            ExperimentError: the folder holds another experiment, other settings, or what other code or other files
+                gave.
         """
         self._lines = folder / REPETITIONS
         self._done: dict[tuple[str, int], Repetition] = {}
         path = folder / SETTINGS
-        header = {"experiment": name, "code": code, "settings": asdict(settings)}
+        header = {"experiment": name, "code": code, "settings": asdict(settings), "inputs": dict(inputs)}
         if overwrite:
             path.unlink(missing_ok=True)
             self._lines.unlink(missing_ok=True)
@@ -106,7 +115,7 @@ class RunStore:
 
 
 def _check(path: Path, wanted: dict[str, Any]) -> None:
-    """Whether a file states this experiment with these settings, and this code.
+    """Whether a file states this experiment with these settings, this code and these files.
 
     Raises:
         ExperimentError: naming what differs.
@@ -115,6 +124,7 @@ def _check(path: Path, wanted: dict[str, Any]) -> None:
     try:
         header = json.loads(path.read_text(encoding="utf-8"))
         name, code, settings = header["experiment"], header.get("code", "unknown"), dict(header["settings"])
+        inputs = dict(header.get("inputs", {}))
     except (ValueError, KeyError, TypeError):
         raise ExperimentError(f"{path} is not of an experiment: {way_out}") from None
     if name != wanted["experiment"]:
@@ -129,3 +139,8 @@ def _check(path: Path, wanted: dict[str, Any]) -> None:
         raise ExperimentError(f"{path.parent} holds other settings ({'; '.join(differing)}): {way_out}")
     if code != wanted["code"]:
         raise ExperimentError(f"{path.parent} was made by other code ({code} there, {wanted['code']} now): {way_out}")
+    changed = [name for name in sorted({*inputs, *wanted["inputs"]}) if inputs.get(name) != wanted["inputs"].get(name)]
+    if changed:
+        raise ExperimentError(
+            f"{path.parent} was made of files that are others now, by their content ({', '.join(changed)}): {way_out}"
+        )

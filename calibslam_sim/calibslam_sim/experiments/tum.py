@@ -227,6 +227,13 @@ def left_out(settings: TumSettings, condition: str) -> float:
     return settings.left_out_of_few if condition.startswith(FEW) else settings.left_out
 
 
+def inputs(settings: TumSettings) -> dict[str, Path]:
+    """The files of the recording, and the calibrator's."""
+    names = (GROUND_TRUTH, ODOMETRY, DETECTIONS, CAMERA_INFO, settings.good_trajectory)
+    found = {name: Path(settings.folder) / name for name in names}
+    return {**found, "calibrator": Path(settings.calibrator)} if settings.calibrator else found
+
+
 def comparisons(settings: TumSettings) -> list[tuple[str, str]]:
     """Calibrated against all others of its family."""
     return [
@@ -287,5 +294,6 @@ EXPERIMENT = Experiment(
     comparisons=comparisons,
     left_out=left_out,
     figure=figure,
+    inputs=inputs,
     document=document,
 )
