@@ -26,12 +26,16 @@ from calibslam_detector.foreign_boxes.log_linear import LogLinearCalibrator
 from calibslam_msgs_py.bags import BagError, refuse_to_replace
 from calibslam_msgs_py.command import command
 from calibslam_msgs_py.measurements import Array, Boxes
+from calibslam_msgs_py.settings import SettingsError, settings_fields
 
 MIN_OBJECTS = 5
 MIN_EDGES = 400
 FOLDS = 5
 EXTENTS_SEEN = (1.0, 99.0)  # [%] of the extents of a recording that count as seen
 LEVELS = np.array([0.5, 0.9])
+# Of the intercept and the coefficients, that a file may hold.
+BOUNDS = {field.name: field.metadata["high"] for field in settings_fields(LogLinearCalibrator)}
+LARGEST = np.array([BOUNDS[name] for name in ("intercept", *FEATURES)])
 
 
 class ReferencedImage(Protocol):
@@ -153,7 +157,7 @@ def _judgement(parts: Sequence[_Predicted]) -> Judgement:
 
 def fit(edges: Edges) -> tuple[EdgeMixture, EdgeMixture]:
     """The model and the best constant."""
-    return fit_mixture(edges.errors, edges.features), fit_mixture(edges.errors, edges.features[:, :0])
+    return fit_mixture(edges.errors, edges.features, LARGEST), fit_mixture(edges.errors, edges.features[:, :0])
 
 
 def held_out(edges: Edges, folds: int = FOLDS) -> Judgement:
@@ -168,11 +172,20 @@ def held_out(edges: Edges, folds: int = FOLDS) -> Judgement:
 
 
 def calibrator(model: EdgeMixture, extents: tuple[float, float]) -> LogLinearCalibrator:
-    """What a file holds of a fitted model: the core; outliers are the business of who uses the boxes."""
+    """What a file holds of a fitted model: the core; outliers are the business of who uses the boxes.
+
+    Raises:
+        CalibratorError: no file can hold it.
+    """
     coefficients = {name: float(c) for name, c in zip(FEATURES, model.coefficients, strict=True)}
-    return LogLinearCalibrator(
-        intercept=model.intercept, **coefficients, least_extent=extents[0], most_extent=extents[1]
-    )
+    try:
+        return LogLinearCalibrator(
+            intercept=model.intercept, **coefficients, least_extent=extents[0], most_extent=extents[1]
+        )
+    except SettingsError as error:
+        raise CalibratorError(
+            f"what was fitted is no calibrator ({error}); record longer, with boxes of more different sizes and scores"
+        ) from None
 
 
 def references(bag: str) -> Sequence[ReferencedImage]:

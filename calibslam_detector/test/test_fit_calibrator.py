@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from small_bag import messages, write
 
-from calibslam_detector.fit_calibrator import Edges, calibrator, fit, held_out, judge, main
+from calibslam_detector.fit_calibrator import LARGEST, Edges, calibrator, fit, held_out, judge, main
 from calibslam_detector.foreign_boxes.calibrator import CalibratorError, load
 from calibslam_detector.foreign_boxes.edge_mixture import EdgeMixture, fit_mixture
 from calibslam_detector.foreign_boxes.features import FEATURES, edge_features
@@ -115,6 +115,49 @@ def test_gross_errors_blow_nothing_up() -> None:
     errors = rng.normal(size=4000) * np.where(rng.random(4000) < 0.1, 10.0, 1.0)
     model = fit_mixture(errors, np.empty((4000, 0)))
     assert np.exp(model.intercept) == pytest.approx(1.0, rel=0.06)
+
+
+def confident(seed: int) -> list[Image]:
+    """Boxes of a detector whose scores are 0.98 to 1, and which errs by 2 px at 1 and by 6.6 px at 0.98."""
+    rng = np.random.default_rng(seed)
+    result = []
+    for _ in range(150):
+        low = rng.uniform(50.0, 300.0, (6, 2))
+        scores = 1.0 - rng.exponential(0.004, 6).clip(0.0, 0.02)
+        boxes = boxes_of(np.concatenate([low, low + rng.uniform(40.0, 200.0, (6, 2))], axis=1), scores)
+        errors = 2.0 * np.exp(60.0 * (1.0 - scores))[:, None] * rng.normal(size=(6, 4))
+        result.append(Image(boxes, errors, np.arange(6)))
+    return result
+
+
+def test_a_confident_detector_gets_a_valid_calibrator(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The likeliest slope would be -57 per score: at a score of 0.5 that were e^27 px."""
+    monkeypatch.setattr("calibslam_detector.fit_calibrator.references", lambda bag: confident(0))
+    assert main(["bag", "--out", str(tmp_path / "c.json")]) == 0
+    found = load(str(tmp_path / "c.json"))
+    assert isinstance(found, LogLinearCalibrator) and found.score < -5.0
+    model, constant = fit(Edges.of(confident(0)))
+    judged = judge(model, constant, Edges.of(confident(1)))
+    assert judged.nll < judged.nll_constant - 0.005
+    assert judged.coverage_90 == pytest.approx(0.9, abs=0.03)
+    # What no file can hold is said, with what to do.
+    with pytest.raises(CalibratorError, match=r"intercept = 56.*record longer"):
+        calibrator(replace(model, intercept=56.0), (20.0, 200.0))
+
+
+def test_limits_are_met_and_matter_only_where_they_are_exceeded() -> None:
+    edges = Edges.of(images(0))
+    free, (intercept, *_) = fit_mixture(edges.errors, edges.features), LARGEST
+    assert np.abs([free.intercept, *free.coefficients]).max() < intercept / 2
+    bound = fit_mixture(edges.errors, edges.features, LARGEST)
+    assert bound.intercept == free.intercept and np.array_equal(bound.coefficients, free.coefficients)
+    tight = fit_mixture(edges.errors, edges.features, np.array([1.0, *LARGEST[1:]]))
+    assert 1.0 - 1e-5 < tight.intercept <= 1.0 < free.intercept
+    # Other features say for the intercept what it must not say.
+    likelihoods = [model.negative_log_likelihoods(edges.errors, edges.features).mean() for model in (free, tight)]
+    assert likelihoods[0] < likelihoods[1] < likelihoods[0] + 0.02
 
 
 def test_judged_on_other_edges() -> None:

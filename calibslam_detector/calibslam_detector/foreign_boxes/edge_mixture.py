@@ -13,7 +13,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.optimize import minimize
+from scipy.optimize import LinearConstraint, minimize
 from scipy.special import expit
 from scipy.stats import norm
 
@@ -23,6 +23,7 @@ from calibslam_msgs_py.measurements import Array
 # against the mean log-likelihood of an edge.
 RIDGE = 1e-3
 LARGEST_LOGARITHM = 7.0  # of sigma [log px] and of the spread
+NEARLY = 1.0 - 1e-6  # of what is allowed: limits are met to rounding
 
 
 @dataclass(frozen=True)
@@ -62,12 +63,15 @@ def _terms(errors: Array, log_sigmas: Array, share: float, spread: float) -> tup
     return -np.logaddexp(core, outlier), expit(core - outlier)
 
 
-def fit_mixture(errors: Array, features: Array) -> EdgeMixture:
+def fit_mixture(errors: Array, features: Array, largest: Array | None = None) -> EdgeMixture:
     """The model of largest likelihood.
 
     Args:
         errors: (N,) [px].
         features: (N, F); F = 0 gives the best constant.
+        largest: (1 + F,) absolute values that intercept and coefficients may have; None: any. A feature that hardly
+            varies, as the scores of a confident detector, asks for a steep slope, and what that says of values that
+            were never seen is absurd.
     """
     mean, scale = features.mean(axis=0), features.std(axis=0)
     scale = np.where(scale > 1e-9, scale, np.inf)  # a feature that never changes tells nothing
@@ -91,6 +95,15 @@ def fit_mixture(errors: Array, features: Array) -> EdgeMixture:
     limit = LARGEST_LOGARITHM
     bounds = [(-limit, 0.0), (-2.0, limit), (-limit, limit)] + [(-3.0, 3.0)] * features.shape[1]
     found = minimize(loss, start, jac=True, method="L-BFGS-B", bounds=bounds).x
+    if largest is not None:
+        # Intercept and coefficients of the features as they are, from the parameters.
+        unscaled = np.zeros((len(largest), len(start)))
+        unscaled[0, 2:] = np.concatenate([[1.0], -mean / scale])
+        unscaled[1:, 3:] = np.diag(1.0 / scale)
+        if (np.abs(unscaled @ found) > largest).any():
+            inside = NEARLY * largest
+            limits = LinearConstraint(unscaled, -inside, inside)
+            found = minimize(loss, start, jac=True, method="SLSQP", bounds=bounds, constraints=[limits]).x
     coefficients = found[3:] / scale
     return EdgeMixture(
         float(found[2] - mean @ coefficients), coefficients, float(expit(found[0])), float(1.0 + np.exp(found[1]))

@@ -14,7 +14,7 @@ from calibslam_msgs_py.settings import Settings, setting
 @dataclass(frozen=True)
 class LogLinearCalibrator(Settings):
     """Diagonal covariances: log sigma of an edge = intercept + sum of coefficient times feature, see
-    `calibrator_features`.
+    `features.FEATURES`.
 
     Boxes that have a covariance keep it. Features are bounded, extents to those it was fitted to: so is sigma.
     """
