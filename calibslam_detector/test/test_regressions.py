@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 import torch
 
-from calibslam_detector.regressions.methods import METHODS, RegressionSettings, run
+from calibslam_detector.regressions.methods import METHODS, RegressionSettings, case, run
+from calibslam_detector.regressions.network import Regressor
 from calibslam_detector.regressions.tasks import BLURS, LABEL_SIGMA_PER_BLUR, SIDE, TASKS, UNIT, bokeh, curve
 
 SMALL = RegressionSettings(degrees=20, sums=50, batch=60, steps=20, size=0.1, effort=0.1)
@@ -44,6 +45,17 @@ def test_every_method_runs(method: str) -> None:
     result = run("curve", method, SMALL, seed=1)
     assert 0.0 <= result["ece_z"] <= 0.5 and 0.0 <= result["ece_q"] <= 0.5
     assert math.isnan(result["nll"]) == (method == "isotonic")
+
+
+@pytest.mark.parametrize("task", list(TASKS))
+def test_fewer_samples_than_a_batch_are_learnt_from(task: str) -> None:
+    repetition = case(task, RegressionSettings(size=0.05), 3)
+    assert len(repetition.training) < repetition.task.batch
+    with torch.random.fork_rng():
+        torch.manual_seed(3)
+        fresh = Regressor(repetition.training)
+    trained = repetition.network.state_dict()
+    assert all(not torch.equal(value, trained[name]) for name, value in fresh.state_dict().items())
 
 
 def test_same_seed_same_numbers() -> None:

@@ -89,12 +89,36 @@ def case(name: str, settings: RegressionSettings, seed: int) -> Case:
     return Case(*_common(name, settings.size, settings.effort, seed), settings, seed)
 
 
+def sized(name: str, size: float, effort: float) -> Task:
+    """A key of `TASKS` with factors on its numbers of samples and of epochs."""
+    task = TASKS[name]
+    sizes = {part: max(1, round(size * getattr(task, part))) for part in ("training", "held_out", "test")}
+    return replace(task, **sizes, epochs=max(1, round(effort * task.epochs)))
+
+
+def check(name: str, method: str, settings: RegressionSettings) -> None:
+    """Whether steps have the residuals that a method (key of `METHODS`) needs on a regression (key of `TASKS`).
+
+    Raises:
+        CalibrationError: f-Cal's sums cannot be made of them.
+    """
+    task, K = sized(name, settings.size, settings.effort), settings.degrees
+    loss: nn.Module
+    if method == "f_cal_cramer":
+        loss = FCalCramer((1, K), generator=torch.Generator())
+    elif method.startswith("f_cal"):
+        loss = FCal(K, generator=torch.Generator())
+    else:
+        return
+    n = min(task.batch, task.training) if method == "f_cal_end_to_end" else min(settings.batch, task.held_out)
+    residuals = torch.zeros(n, task.components)
+    loss(residuals, torch.ones_like(residuals), residuals)
+
+
 @lru_cache(maxsize=32)
 def _common(name: str, size: float, effort: float, seed: int) -> tuple[Task, Samples, Samples, Samples, Regressor]:
     """What does not depend on f-Cal's settings; kept, as every method begins with it."""
-    task = TASKS[name]
-    sizes = {part: max(1, round(size * getattr(task, part))) for part in ("training", "held_out", "test")}
-    task = replace(task, **sizes, epochs=max(1, round(effort * task.epochs)))
+    task = sized(name, size, effort)
     generator = torch.Generator().manual_seed(seed)
     training, held_out = task.draw(task.training + task.held_out, generator).split(task.training)
     test = task.draw(task.test, generator)

@@ -86,7 +86,7 @@ def train(
         best, best_loss = network.state_dict(), float("inf")
         for _ in range(task.epochs):
             network.train()
-            for batch in _batches(len(training), task.batch):
+            for batch in _batches(len(training), min(task.batch, len(training))):
                 _step(optimiser, loss(*network(training.x[batch]), training.y[batch]))
             schedule.step()
             network.eval()

@@ -80,11 +80,13 @@ class Task:
 
     Attributes:
         draw: (n, generator) -> samples.
+        components: d of a label.
         training, held_out, test: numbers of samples.
         epochs, batch: of the training.
     """
 
     draw: Callable[[int, torch.Generator], Samples]
+    components: int
     training: int
     held_out: int
     test: int
@@ -93,6 +95,6 @@ class Task:
 
 
 TASKS = {
-    "curve": Task(curve, training=1000, held_out=2000, test=40000, epochs=40, batch=100),
-    "bokeh": Task(bokeh, training=1500, held_out=1000, test=10000, epochs=30, batch=100),
+    "curve": Task(curve, components=1, training=1000, held_out=2000, test=40000, epochs=40, batch=100),
+    "bokeh": Task(bokeh, components=2, training=1500, held_out=1000, test=10000, epochs=30, batch=100),
 }

@@ -10,10 +10,19 @@ from pathlib import Path
 from typing import Any
 
 from calibslam_detector.calibration.reliability import plot, reliability
+from calibslam_detector.calibration.residuals import CalibrationError
 from calibslam_detector.regressions import methods
 from calibslam_detector.regressions.methods import METHODS, SUM_DEGREES, RegressionSettings
 from calibslam_detector.regressions.tasks import TASKS
-from calibslam_sim.experiments.design import Experiment, ExperimentSettings, Metric, Metrics, Seed, repetition_seed
+from calibslam_sim.experiments.design import (
+    Experiment,
+    ExperimentError,
+    ExperimentSettings,
+    Metric,
+    Metrics,
+    Seed,
+    repetition_seed,
+)
 from calibslam_sim.experiments.figures import condition_figure
 
 
@@ -44,11 +53,14 @@ SHOWN = ("nll", "f_cal_kl", "f_cal_wasserstein", "temperature")  # in the reliab
 
 def run(settings: FcalSettings, condition: str, seed: Seed) -> Metrics:
     """One condition on one seed."""
+    task, method, changed = _meant(condition)
+    return methods.run(task, method, replace(_regression(settings), **changed), _number(seed))
+
+
+def _meant(condition: str) -> tuple[str, str, dict[str, Any]]:
+    """The regression of a condition, its method, and the settings that it changes."""
     task, _, method = condition.partition("_")
-    if condition in VARIANTS:
-        method, changed = VARIANTS[condition]
-        settings = replace(settings, **changed)
-    return methods.run(task, method, _regression(settings), _number(seed))
+    return (task, *VARIANTS[condition]) if condition in VARIANTS else (task, method, {})
 
 
 def _regression(settings: FcalSettings) -> RegressionSettings:
@@ -61,8 +73,19 @@ def _number(seed: Seed) -> int:
 
 
 def conditions(settings: FcalSettings) -> list[str]:
-    """Every method on every regression, then the variants."""
-    return [f"{task}_{method}" for task in TASKS for method in METHODS] + list(VARIANTS)
+    """Every method on every regression, then the variants.
+
+    Raises:
+        ExperimentError: K does not fit the numbers of samples, or of components.
+    """
+    names = [f"{task}_{method}" for task in TASKS for method in METHODS] + list(VARIANTS)
+    for name in names:  # before any process is started
+        task, method, changed = _meant(name)
+        try:
+            methods.check(task, method, replace(_regression(settings), **changed))
+        except CalibrationError as error:
+            raise ExperimentError(f"{name}: {error}; change --degrees, --size or --batch") from error
+    return names
 
 
 def comparisons(settings: FcalSettings) -> list[tuple[str, str]]:
