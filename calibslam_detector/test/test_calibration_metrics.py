@@ -160,6 +160,9 @@ def test_band_holds_the_truth_as_often_as_it_says() -> None:
     outside = sum(not curve.is_calibrated for curve in curves)
     assert 4 <= outside <= 40 + 3 * 6
     assert curves[0].half_width == pytest.approx(math.sqrt(math.log(20.0) / 400.0))
+    # 40 sums of 25 rows of two.
+    of_sums = reliability(np.random.default_rng(0).standard_normal((1000, 2)), K=50, confidence=0.9)
+    assert of_sums.half_width == pytest.approx(math.sqrt(math.log(20.0) / 80.0))
 
 
 def test_reliability_plot(tmp_path: Path, rng: np.random.Generator) -> None:

@@ -18,7 +18,7 @@ import pytest
 import torch
 
 from calibslam_detector import evaluate_detector, train
-from calibslam_detector.images.coco_data import DataError, TrainingImages, load_coco_data
+from calibslam_detector.images.coco_data import CocoData, DataError, ImageTruth, TrainingImages, load_coco_data
 from calibslam_detector.model import weights_file
 from calibslam_detector.model.network import CalibratedDetector
 from calibslam_detector.model.region_cues import CUES
@@ -26,6 +26,7 @@ from calibslam_detector.model.weights_file import WeightsError
 from calibslam_detector.training import training_loop
 from calibslam_detector.training.covariance_task import LOSSES, Examples, covariance_task
 from calibslam_detector.training.training_loop import LoopSettings, Task, TrainingError, batch_of, optimise
+from calibslam_msgs_py.measurements import Boxes
 
 COLOURS = {"cup": (40, 40, 220), "book": (220, 60, 40)}
 FAST = ["--batch", "2", "--log-every", "1", "--warm-up", "0"]
@@ -378,6 +379,21 @@ def test_too_few_whole_objects_for_f_cal_are_said(every: int, batch: int, says: 
     assert covariance_task(model, few, "nll", batch, LoopSettings(), torch.device("cpu")).losses(0) is not None
 
 
+def test_cut_boxes_are_in_the_likelihood_and_not_in_f_cals_sums() -> None:
+    """What their residuals are changes the one and not the other."""
+    model, half = CalibratedDetector("compact", ("cup", "book")), of_whole_objects(2)
+    cut = replace(half, residuals=torch.where(half.whole[:, None], half.residuals, 0.0))
+    found = []
+    for each in (half, cut):
+        torch.manual_seed(0)
+        task = covariance_task(model, each, "f_cal_cramer", 400, LoopSettings(), torch.device("cpu"))
+        losses = task.losses(0)
+        assert losses is not None
+        found.append({name: float(value.detach()) for name, value in losses.items()})
+    assert found[0]["calibration"] == found[1]["calibration"]
+    assert abs(found[0]["nll"] - found[1]["nll"]) > 1e-4
+
+
 def test_a_step_that_has_too_few_whole_objects_by_chance_is_left_out() -> None:
     """Half of 100 on average, and 50 are needed: about half of the steps have fewer."""
     model, half = CalibratedDetector("compact", ("cup", "book")), of_whole_objects(2)
@@ -425,6 +441,30 @@ def test_a_run_that_failed_before_its_first_checkpoint_begins_again(
     assert (tmp_path / "run" / "examples.pt").exists()
     monkeypatch.setattr(train, "MIN_EXAMPLES", 2)
     assert train.main(options) == 0
+
+
+def test_only_sure_boxes_of_whole_objects_are_judged_for_calibration(tmp_path: Path) -> None:
+    """Of five objects one lies whole in the image and is found surely, one is cut, one is found with a small score, one
+    not at all, and one is a crowd."""
+    true = np.array([[10, 10, 40, 40], [0, 50, 30, 80], [60, 10, 90, 40], [60, 50, 90, 80], [100, 50, 120, 80.0]])
+    labels = np.ones(5, np.int64)
+    truth = ImageTruth(1, tmp_path / "1.png", true, labels, np.array([False, False, False, False, True]))
+    found = Boxes(
+        stamp=0,
+        width=128,
+        height=96,
+        corners=true[[0, 1, 2, 4]] + 1.0,
+        covariances=np.arange(1.0, 5.0)[:, None, None] * np.eye(4),
+        class_ids=("cup",) * 4,
+        scores=np.array([0.9, 0.9, 0.4, 0.9]),
+        object_ids=("",) * 4,
+    )
+    data = CocoData(tmp_path / "a.json", ("cup",), (truth, truth))
+    sure = evaluate_detector.errors_of_whole_objects([found, None], data, 0.5)
+    np.testing.assert_array_equal(sure.errors, np.full((1, 4), -1.0))
+    np.testing.assert_array_equal(sure.covariances, np.eye(4)[None])
+    less_sure = evaluate_detector.errors_of_whole_objects([found, None], data, 0.3)
+    np.testing.assert_array_equal(less_sure.covariances, np.array([1.0, 3.0])[:, None, None] * np.eye(4))
 
 
 def test_stage_covariance_needs_a_detector(data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -184,14 +184,17 @@ def test_weights_of_the_distances() -> None:
 
 @pytest.mark.parametrize("K", [1, 4, 20])
 def test_evidence_of_true_covariances_is_alike_for_all_sums(K: int) -> None:
-    """The mean of n times the classic statistic is 1/6 for any K, so distances vary as K does; 4 standard errors."""
-    n = 240
-    values = []
-    for seed in range(400):
-        squares = normal(n, 4, seed=seed).square()
-        sums = squares[:, 0] if K == 1 else squares.sum(dim=1).view(-1, K // 4).sum(dim=1)
-        values.append(cramervonmises(sums.numpy(), "chi2", args=(K,)).statistic)
-    assert abs(np.mean(values) - 1.0 / 6.0) < 4.0 * np.std(values) / math.sqrt(len(values)) < 0.04
+    """n times the classic statistic has the mean 1/6 and the variance 1/45 for any K. Ours is without bias, with the mean
+    0 and the variance n/(n - 1) times that; so distances vary as K does. 4 standard errors."""
+    squares = normal(240, 4, 4000).square()
+    sums = squares[:, 0] if K == 1 else squares.sum(dim=1).view(-1, K // 4, 4000).sum(dim=1)
+    n = len(sums)
+    values = n * cramer_von_mises(chi_squared_probability(sums, K)).numpy()
+    error = np.std(values) / math.sqrt(len(values))
+    assert abs(np.mean(values)) < 4.0 * error < 0.01
+    assert np.std(values) == pytest.approx(math.sqrt(n / (n - 1) / 45.0), rel=0.12)
+    classic = [cramervonmises(each, "chi2", args=(K,)).statistic for each in sums.T[:400].numpy()]
+    assert abs(np.mean(classic) - 1.0 / 6.0) < 4.0 * np.std(classic) / math.sqrt(len(classic)) < 0.04
 
 
 def test_settings_are_checked() -> None:

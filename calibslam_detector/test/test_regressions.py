@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 import torch
 
-from calibslam_detector.regressions.methods import METHODS, RegressionSettings, case, run
+from calibslam_detector.calibration.f_cal import kl, wasserstein
+from calibslam_detector.regressions.methods import METHODS, RegressionSettings, case, f_cal, run
 from calibslam_detector.regressions.network import Regressor
 from calibslam_detector.regressions.tasks import BLURS, LABEL_SIGMA_PER_BLUR, SIDE, TASKS, UNIT, bokeh, curve
 
@@ -56,6 +57,17 @@ def test_fewer_samples_than_a_batch_are_learnt_from(task: str) -> None:
         fresh = Regressor(repetition.training)
     trained = repetition.network.state_dict()
     assert all(not torch.equal(value, trained[name]) for name, value in fresh.state_dict().items())
+
+
+def test_wasserstein_pulls_as_kl_does_on_a_common_factor() -> None:
+    """Sums of K squares of residuals 2 % too large have the variance 2K 1.02^4 and are off by K (1.02^2 - 1)."""
+    repetition = case("curve", RegressionSettings(size=0.05, effort=0.05, degrees=40), 3)
+    variance, bias = torch.tensor(80.0 * 1.02**4), torch.tensor(40.0 * (1.02**2 - 1.0))
+    pulls = []
+    for name, divergence in (("kl", kl), ("wasserstein", wasserstein)):
+        weight = f_cal(repetition, name, 0.3).weight
+        pulls.append(weight / (1.0 - weight) * float(divergence(variance, bias**2, 40.0)))
+    assert pulls[1] == pytest.approx(pulls[0], rel=0.1)
 
 
 def test_same_seed_same_numbers() -> None:

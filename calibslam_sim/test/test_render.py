@@ -13,13 +13,13 @@ from pycocotools.coco import COCO
 
 from calibslam_backend.geometry.ellipsoid import Ellipsoid
 from calibslam_msgs_py.bags import BagReader
-from calibslam_msgs_py.measurements import SECOND, Camera
+from calibslam_msgs_py.measurements import SECOND, Array, Camera
 from calibslam_sim import render_dataset, simulate, topics
 from calibslam_sim.rendering.coco_writer import CLASSES
 from calibslam_sim.rendering.kernels import cast, cast_shadows, visible_parts
-from calibslam_sim.rendering.looks import FAMILIAR, FAMILIES, FOREIGN
+from calibslam_sim.rendering.looks import FAMILIAR, FAMILIES, FOREIGN, looks
 from calibslam_sim.rendering.render import SAME_EDGE, Renderer
-from calibslam_sim.simulation.camera_path import START
+from calibslam_sim.simulation.camera_path import START, camera_path
 from calibslam_sim.simulation.recording import CAMERA
 from calibslam_sim.simulation.world import desk_world
 
@@ -85,6 +85,22 @@ def test_the_same_seed_gives_the_same_image() -> None:
     np.testing.assert_array_equal(first.visible_boxes, second.visible_boxes)
     assert first.jpeg() == second.jpeg()
     assert (Renderer(world, SMALL, 4, 1.0, "familiar").render(START).image != first.image).mean() > 0.5
+
+
+def test_the_stamp_is_the_middle_of_the_exposure(monkeypatch: pytest.MonkeyPatch) -> None:
+    """By the poses of the camera that an image asks for: shutter opens, boxes, shutter closes."""
+    asked = []
+
+    def noted(times: np.ndarray, pace: float, seed: int) -> Array:
+        asked.append(times)
+        return camera_path(times, pace, seed)
+
+    monkeypatch.setattr("calibslam_sim.rendering.render.camera_path", noted)
+    world = desk_world(3)
+    Renderer(world, SMALL, 3, 1.0, "familiar").render(START)
+    ((opens, middle, closes),) = asked
+    exposure = looks(world, 3, "familiar").optics.exposure_time
+    assert START - opens == closes - middle == pytest.approx(exposure / 2.0 * SECOND, abs=1.0) and middle == START
 
 
 def test_boxes_are_those_of_the_visible_parts() -> None:

@@ -14,6 +14,7 @@ from scipy import stats
 from calibslam_backend.geometry.ellipsoid import Ellipsoid
 from calibslam_backend.geometry.visible_box import image_bounds, project
 from calibslam_msgs_py.measurements import Array
+from calibslam_sim.simulation.box_noise import BoxConditions, BoxNoise
 from calibslam_sim.simulation.camera_path import ORBIT, camera_path, stamps
 from calibslam_sim.simulation.detections import Detector
 from calibslam_sim.simulation.gross_errors import KINDS
@@ -185,6 +186,31 @@ def test_boxes_err_as_much_as_they_say() -> None:
     assert low < np.sum(squares) < high
     assert stats.kstest(squares, stats.chi2(4).cdf).pvalue > 0.01
     np.testing.assert_allclose(np.cov(whitened.T), np.eye(4), atol=0.1)
+
+
+def test_covariance_of_a_box_by_hand() -> None:
+    """100 x 50 px, half hidden, moving by (10, -20) px; then the same, cut and at rest."""
+    conditions = BoxConditions(
+        extents=np.full((2, 1, 2), [100.0, 50.0]),
+        hidden=np.array([[0.5], [0.5]]),
+        is_cut=np.array([[False], [True]]),
+        image_motion=np.array([[[10.0, -20.0]], [[0.0, 0.0]]]),
+        edge_difficulty=np.array([[1.0, 1.0, 1.0, 2.0]]),
+        edge_correlation=np.array([0.2]),
+    )
+    moving, cut = BoxNoise().covariances(conditions)[:, 0]
+    # A floor of 1 px, and 3 % of the extent times 1 + 3 * 0.5, for ymax twice that; smeared by 0.3 of the motion.
+    x, y, ymax = np.hypot(1.0, [0.03 * 100 * 2.5, 0.03 * 50 * 2.5, 0.03 * 50 * 2.5 * 2.0])
+    np.testing.assert_allclose(
+        moving,
+        [
+            [x**2 + 9.0, -18.0, 0.2 * x**2 + 9.0, -18.0],
+            [-18.0, y**2 + 36.0, -18.0, 0.2 * y * ymax + 36.0],
+            [0.2 * x**2 + 9.0, -18.0, x**2 + 9.0, -18.0],
+            [-18.0, 0.2 * y * ymax + 36.0, -18.0, ymax**2 + 36.0],
+        ],
+    )
+    assert cut[0, 0] == pytest.approx(1.0 + (0.03 * 100 * 2.5 * 1.6) ** 2)
 
 
 @pytest.mark.parametrize("memory", [0.0, 0.5])
