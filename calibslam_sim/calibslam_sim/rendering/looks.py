@@ -39,7 +39,7 @@ class ClassLook:
     """How a class looks.
 
     Attributes:
-        pattern: of `render_kernels.PATTERNS`.
+        pattern: of `kernels.PATTERNS`.
         colours: three, as hue, saturation, value.
         hue_spread: standard deviation of the hue of the second colour between objects.
         frequency: of the pattern.
@@ -82,7 +82,7 @@ FOREIGN = {
 
 @dataclass(frozen=True)
 class Looks:
-    """How one world looks; the arrays are those of `render_kernels.shade`."""
+    """How one world looks; the arrays are those of `kernels.shade`."""
 
     patterns: np.ndarray
     numbers: Array
@@ -127,7 +127,7 @@ def _object_colours(look: ClassLook, rng: np.random.Generator) -> Array:
 
 
 def _light(foreign: bool, rng: np.random.Generator) -> Array:
-    """Lamp: position [m], colour, ambient share, range [m], see `render_kernels.shade`."""
+    """Lamp: position [m], colour, ambient share, range [m], see `kernels.shade`."""
     position = [*rng.uniform(-1.6, 1.6, 2), rng.uniform(1.3, 1.7) if foreign else rng.uniform(1.9, 2.5)]
     warmth = rng.normal(0.0, 0.1)
     colour = [1.1, 0.6, 0.75] if foreign else [1.0 + warmth, 1.0, 1.0 - warmth]

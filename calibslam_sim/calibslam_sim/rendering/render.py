@@ -64,7 +64,7 @@ class Renderer:
         camera: without distortion.
         seed: of textures, light, optics and noise, and of the camera's path.
         pace: of the camera's path.
-        family: of appearances, see `render_looks`.
+        family: of appearances, see `looks.FAMILIES`.
     """
 
     def __init__(self, world: tuple[WorldObject, ...], camera: Camera, seed: int, pace: float, family: str) -> None:
