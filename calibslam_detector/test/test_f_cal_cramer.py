@@ -184,8 +184,8 @@ def test_weights_of_the_distances() -> None:
 
 @pytest.mark.parametrize("K", [1, 4, 20])
 def test_evidence_of_true_covariances_is_alike_for_all_sums(K: int) -> None:
-    """n times the classic statistic has the mean 1/6 and the variance 1/45 for any K. Ours is without bias, with the mean
-    0 and the variance n/(n - 1) times that; so distances vary as K does. 4 standard errors."""
+    """n times the classic statistic has the mean 1/6 and the variance 1/45 for any K. Ours is without bias: the mean is
+    0, the variance n/(n - 1) times that; so distances vary as K does. 4 standard errors."""
     squares = normal(240, 4, 4000).square()
     sums = squares[:, 0] if K == 1 else squares.sum(dim=1).view(-1, K // 4, 4000).sum(dim=1)
     n = len(sums)

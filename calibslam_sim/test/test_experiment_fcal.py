@@ -7,9 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from calibslam_sim import experiment
 from calibslam_sim.experiments import fcal
-from calibslam_sim.experiments.design import repetition_seed
+from calibslam_sim.experiments.design import ExperimentError, repetition_seed
 from calibslam_sim.experiments.fcal import VARIANTS, FcalSettings, comparisons, conditions, run
 
 SMALL = FcalSettings(degrees=20, sums=50, batch=100, steps=10, size=0.2, effort=0.05)
@@ -38,17 +37,15 @@ def test_a_condition_that_is_not_there_is_refused() -> None:
         run(SMALL, "curve_magic", repetition_seed(0, 0))
 
 
-def test_sums_that_cannot_be_made_are_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_sums_that_cannot_be_made_are_said() -> None:
     """Before anything is computed, and with what to do."""
-    for options, says in (
-        (["--degrees", "25"], "bokeh_f_cal_kl: K = 25 is no multiple of the 2 components"),
-        (["--size", "0.05"], "curve_f_cal_end_to_end: sums of K = 50 squares need more than 50 residuals of 1; got 50"),
-        (["--batch", "80"], "curve_f_cal_cramer: two sums of K = 50 squares need 100 residuals of 1; got 80"),
+    for settings, says in (
+        (FcalSettings(degrees=25), "bokeh_f_cal_kl: K = 25 is no multiple of the 2 components"),
+        (FcalSettings(size=0.05), "curve_f_cal_end_to_end: sums of K = 50 squares need more than 50 residuals"),
+        (FcalSettings(batch=80), "curve_f_cal_cramer: two sums of K = 50 squares need 100 residuals of 1; got 80"),
     ):
-        assert experiment.main(["fcal", "--out", str(tmp_path / "out"), *options]) == 1
-        said = capsys.readouterr().err
-        assert says in said and "change --degrees, --size or --batch" in said
-    assert not (tmp_path / "out").exists()
+        with pytest.raises(ExperimentError, match=f"{says}.*; change --degrees, --size or --batch"):
+            conditions(settings)
     assert conditions(FcalSettings(size=0.05, degrees=20)) == conditions(FcalSettings())
 
 

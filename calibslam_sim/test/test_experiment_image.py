@@ -84,9 +84,9 @@ def test_without_a_second_detector_there_is_no_condition_for_it(files: dict[str,
 
 def test_the_files_it_is_computed_from_are_known(files: dict[str, Path]) -> None:
     """The shipped ones, too."""
-    assert set(image.inputs(image.ImageSettings()).values()) == {SHIPPED, SHIPPED_NLL_HEAD}
+    assert set(image.EXPERIMENT.inputs(image.ImageSettings()).values()) == {SHIPPED, SHIPPED_NLL_HEAD}
     one = image.ImageSettings(nll_weights=str(files["nll"]))
-    assert image.inputs(one) == {"weights of calibrated": SHIPPED, "weights of nll": files["nll"]}
+    assert image.EXPERIMENT.inputs(one) == {"weights of calibrated": SHIPPED, "weights of nll": files["nll"]}
 
 
 def test_the_command(files: dict[str, Path], tmp_path: Path) -> None:

@@ -247,7 +247,7 @@ def test_tum_names_every_file_that_it_reads(folder: Path, tmp_path: Path, monkey
     monkeypatch.setattr("builtins.open", noted)
     tum.recorded.cache_clear()
     tum.recorded(settings)
-    assert {path for path in read if path.parent in (folder, tmp_path)} == set(tum.inputs(settings).values())
+    assert {path for path in read if path.parent in (folder, tmp_path)} == set(tum.EXPERIMENT.inputs(settings).values())
 
 
 def test_tum_noise_has_its_size(folder: Path) -> None:
