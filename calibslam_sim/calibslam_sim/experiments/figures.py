@@ -107,7 +107,7 @@ def condition_figure(
             values = defined(found["values"])
             panel.plot(values, np.full(len(values), place + 0.15), "|", color="0.5", markersize=7)
             if len(values):
-                half = half_interval(values, result["left_out"].get(condition, 0.0))
+                half = half_interval(values, result.get("left_out", {}).get(condition, 0.0))
                 panel.errorbar(found["mean"], place - 0.1, xerr=half, fmt="o", color="black", capsize=4)
         panel.set_yticks(places, conditions if i % columns == 0 else [""] * len(conditions))
         panel.set_ylim(-0.6, len(conditions) - 0.4)
