@@ -10,6 +10,7 @@ import os
 import shutil
 from collections import Counter
 from collections.abc import Collection, Iterator
+from contextlib import suppress
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Literal
@@ -174,36 +175,37 @@ def _damaged(path: Path, error: Exception) -> BagError:
 class BagWriter:
     """Writes a rosbag2 folder, or a single file if the path ends in .mcap; a context manager.
 
-    If the context is left by an exception, nothing stays behind.
+    It is written beside its place and put there when it is complete. If the context is left by an exception, or the
+    disk is full, nothing of it stays behind, and a bag that was to be replaced is as it was.
 
     Args:
         path: of the bag; missing parent folders are made.
         overwrite: replace an existing bag (never anything that is not a bag).
 
     Raises:
-        BagError: the path exists.
+        BagError: the path exists, or cannot be written.
     """
 
     def __init__(self, path: str | Path, overwrite: bool = False) -> None:
         self.path = Path(path)
-        if self.path.exists() or self.path.is_symlink():
-            if not overwrite:
-                raise BagError(f"{self.path} exists already; choose another path, or replace it: --overwrite")
-            _remove_bag(self.path)
+        self._overwrite = overwrite
+        self._refuse_to_lose()
         self._single_file = self.path.suffix == ".mcap"
-        # rosbags writes folders only: a single file is written in one beside it, and moved out at the end.
+        # A bag holds its own name: the folder in which it is written has another one, not the bag.
         self._scratch = self.path.with_name(f".{self.path.name}.part")
-        folder = self._scratch / self.path.stem if self._single_file else self.path
-        if self._single_file and self._scratch.exists():
-            shutil.rmtree(self._scratch)
         self._store = calibslam_typestore()
         self._connections: dict[str, Connection] = {}
-        self._writer = Writer(folder, version=ROSBAG2_VERSION, storage_plugin=StoragePlugin.MCAP)
-        self._writer.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)
         try:
+            if self._scratch.exists():
+                shutil.rmtree(self._scratch)
+            # rosbags writes folders only: of a single file's, the file is moved out at the end.
+            folder = self._scratch / (self.path.stem if self._single_file else self.path.name)
+            self._writer = Writer(folder, version=ROSBAG2_VERSION, storage_plugin=StoragePlugin.MCAP)
+            self._writer.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)
             self._writer.open()
         except OSError as error:
-            raise BagError(f"cannot write {self.path}: {error}") from error
+            shutil.rmtree(self._scratch, ignore_errors=True)
+            raise self._unwritable(error) from error
 
     def __enter__(self) -> BagWriter:
         return self
@@ -211,16 +213,44 @@ class BagWriter:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        if kind is None:
-            self._writer.close()
-            if self._single_file:
-                (self._writer.path / f"{self.path.stem}.mcap").replace(self.path)
-        else:
-            self._writer.abort()
-            if not self._single_file:
-                shutil.rmtree(self.path, ignore_errors=True)
-        if self._single_file:
+        try:
+            if kind is None:
+                self._writer.close()
+                self._put_in_place()
+        except OSError as failure:
+            raise self._unwritable(failure) from failure
+        finally:
+            with suppress(OSError):  # what is left of it does not fit on the disk either
+                self._writer.abort()
             shutil.rmtree(self._scratch, ignore_errors=True)
+
+    def _put_in_place(self) -> None:
+        """Move what was written to its path, and what is there out of the way first; it goes with the scratch."""
+        self._refuse_to_lose()  # somebody may have put something there meanwhile
+        written = self._writer.path
+        if self._single_file:
+            written = written / f"{self.path.stem}.mcap"
+        if not _is_there(self.path) or (self._single_file and not self.path.is_dir()):
+            written.replace(self.path)
+            return
+        replaced = self._scratch / f"{self.path.name}.replaced"
+        self.path.rename(replaced)
+        try:
+            written.rename(self.path)
+        except BaseException:
+            replaced.rename(self.path)
+            raise
+
+    def _refuse_to_lose(self) -> None:
+        """Refuse to replace what is there, unless it is a bag and this is wanted."""
+        if not _is_there(self.path):
+            return
+        if not self._overwrite:
+            raise BagError(f"{self.path} exists already; choose another path, or replace it: --overwrite")
+        _refuse_unless_bag(self.path)
+
+    def _unwritable(self, error: OSError) -> BagError:
+        return BagError(f"cannot write {self.path}: {error.strerror or error}; make room, or choose another path")
 
     def write(self, topic: str, message: Any, stamp: int) -> None:
         """Add a message of `bags.types` at a log time [ns]; the topic is made with the first message."""
@@ -230,7 +260,10 @@ class BagWriter:
     def write_raw(self, topic: str, kind: str, data: bytes | memoryview, stamp: int) -> None:
         """Add a serialised (CDR) message of type `kind`, such as "nav_msgs/msg/Path"."""
         self.add_topic(topic, kind)
-        self._writer.write(self._connections[topic], int(stamp), data)
+        try:
+            self._writer.write(self._connections[topic], int(stamp), data)
+        except OSError as error:
+            raise self._unwritable(error) from error
 
     def adopt(self, bag: BagReader) -> list[str]:
         """Learn the message types of another bag; returns its topics whose messages can be copied as they are.
@@ -281,14 +314,17 @@ def refuse_to_replace(out: Path, *read: str | Path) -> None:
                 raise BagError(f"{out} would replace {part}, which is read: choose another path for the result")
 
 
-def _remove_bag(path: Path) -> None:
-    """Remove a bag, and refuse to remove anything else."""
+def _is_there(path: Path) -> bool:
+    """Whether a path is taken, if only by a link that leads nowhere."""
+    return path.exists() or path.is_symlink()
+
+
+def _refuse_unless_bag(path: Path) -> None:
+    """Refuse to replace anything but a bag."""
     if path.is_file() and path.suffix == ".mcap":
-        path.unlink()
         return
     foreign = (
         [p for p in path.iterdir() if p.name != "metadata.yaml" and p.suffix != ".mcap"] if path.is_dir() else [path]
     )
     if foreign:
         raise BagError(f"{path} is not overwritten: it is not a bag, or holds other files ({foreign[0].name})")
-    shutil.rmtree(path)

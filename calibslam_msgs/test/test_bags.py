@@ -1,5 +1,7 @@
 """Bags: what is written is read, by others too; what is broken is said."""
 
+import resource
+import signal
 from pathlib import Path
 
 import numpy as np
@@ -227,6 +229,54 @@ def test_a_failed_write_leaves_nothing_behind(tmp_path: Path, name: str) -> None
         bag.write("/detections", c.boxes_to_msg(some_boxes(1), bags.types), 1)
         raise RuntimeError
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("name", ["bag", "run.mcap"])
+@pytest.mark.parametrize("ending", [RuntimeError, KeyboardInterrupt])
+def test_a_failed_write_leaves_the_old_bag_alone(tmp_path: Path, name: str, ending: type[BaseException]) -> None:
+    path = write(tmp_path / name, n=2)
+    with pytest.raises(ending), BagWriter(path, overwrite=True) as bag:
+        bag.write("/detections", c.boxes_to_msg(some_boxes(1), bags.types), 1)
+        raise ending
+    assert list(tmp_path.iterdir()) == [path]
+    with BagReader(path) as bag:
+        assert bag.counts["/detections"] == 2
+
+
+@pytest.mark.parametrize("name", ["bag", "run.mcap"])
+def test_a_full_disk_is_said_and_leaves_the_old_bag_alone(tmp_path: Path, name: str) -> None:
+    path = write(tmp_path / name, n=2)
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    handler = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    try:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (512, before[1]))
+        with pytest.raises(BagError, match=rf"cannot write .*{name}: File too large; make room"):
+            write(path, n=20, overwrite=True)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+        signal.signal(signal.SIGXFSZ, handler)
+    assert list(tmp_path.iterdir()) == [path]
+    with BagReader(path) as bag:
+        assert bag.counts["/detections"] == 2
+
+
+@pytest.mark.parametrize("name", ["bag", "run.mcap"])
+def test_a_link_is_replaced_and_not_what_it_leads_to(tmp_path: Path, name: str) -> None:
+    first = write(tmp_path / "first" / name, n=2)
+    link = tmp_path / name
+    link.symlink_to(first)
+    write(link, n=3, overwrite=True)
+    for path, n in ((first, 2), (link, 3)):
+        with BagReader(path) as bag:
+            assert bag.counts["/detections"] == n
+    assert not link.is_symlink()
+
+
+def test_what_came_meanwhile_is_not_replaced(tmp_path: Path) -> None:
+    with pytest.raises(BagError, match="exists already"), BagWriter(tmp_path / "bag"):
+        write(tmp_path / "other").rename(tmp_path / "bag")
+    with BagReader(tmp_path / "bag") as bag:
+        assert bag.counts["/detections"] == 20
 
 
 def test_topics_keep_their_type(tmp_path: Path) -> None:
