@@ -26,6 +26,7 @@ from calibslam_sim.simulation.recording import CAMERA
 from calibslam_sim.simulation.world import desk_world
 
 PACES = (0.3, 2.5)  # between a slow and a hasty walk
+INTERRUPTED = 130  # exit code, as of a process that SIGINT ended
 
 
 @dataclass(frozen=True)
@@ -64,12 +65,17 @@ def main(argv: Sequence[str] | None = None) -> int:
     settings = from_arguments(arguments, DatasetSettings)
     try:
         writer = CocoWriter(arguments.out, arguments.overwrite)
-        render_dataset(settings, writer)
-        writer.close()
     except CocoError as error:
         print(f"render_dataset: {error}", file=sys.stderr)
         return 1
-    print(f"{arguments.out}: {settings.worlds * settings.images_per_world} images")
+    try:
+        render_dataset(settings, writer)
+    except KeyboardInterrupt:
+        print("render_dataset: interrupted; the images that there are have their annotations", file=sys.stderr)
+        return INTERRUPTED
+    finally:  # images without annotations are worth nothing
+        images = writer.close()
+    print(f"{arguments.out}: {images} images")
     return 0
 
 

@@ -24,7 +24,7 @@ from calibslam_msgs_py.measurements import QuadricEstimate, StampedPose
 from calibslam_msgs_py.settings import add_arguments, from_arguments
 from calibslam_sim import topics
 from calibslam_sim.progress import Progress
-from calibslam_sim.rendering.coco_writer import CocoError, CocoWriter
+from calibslam_sim.rendering.coco_writer import IMAGES, CocoError, CocoWriter
 from calibslam_sim.rendering.looks import FAMILIES
 from calibslam_sim.rendering.render import RenderedImage, Renderer
 from calibslam_sim.simulation.recording import SCENARIOS, Simulation, SimulationSettings, simulate
@@ -119,6 +119,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     arguments = parser.parse_args(argv)
     if arguments.coco is not None and not arguments.images:
         parser.error("--coco needs --images")
+    if arguments.coco is not None and arguments.out.resolve() in (arguments.coco / IMAGES).resolve().parents:
+        parser.error(f"--coco {arguments.coco} lies in the bag {arguments.out}: choose another folder")
     if arguments.image_every < 1:
         parser.error(f"--image-every must be 1 or more, not {arguments.image_every}")
     settings = from_arguments(arguments, SimulationSettings)
@@ -130,9 +132,11 @@ def main(argv: Sequence[str] | None = None) -> int:
             render = Renderer(simulation.world, simulation.camera, settings.seed, settings.pace, arguments.looks).render
         if arguments.coco is not None:
             coco = CocoWriter(arguments.coco, arguments.overwrite)
-        write_bag(simulation, arguments.out, arguments.overwrite, render, coco, arguments.image_every)
-        if coco is not None:
-            coco.close()
+        try:
+            write_bag(simulation, arguments.out, arguments.overwrite, render, coco, arguments.image_every)
+        finally:  # images without annotations are worth nothing
+            if coco is not None:
+                coco.close()
     except (bags.BagError, CocoError) as error:
         print(f"simulate: {error}", file=sys.stderr)
         return 1

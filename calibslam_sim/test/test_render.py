@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -15,10 +16,10 @@ from calibslam_backend.geometry.ellipsoid import Ellipsoid
 from calibslam_msgs_py.bags import BagReader
 from calibslam_msgs_py.measurements import SECOND, Array, Camera
 from calibslam_sim import render_dataset, simulate, topics
-from calibslam_sim.rendering.coco_writer import CLASSES
+from calibslam_sim.rendering.coco_writer import CLASSES, DESCRIPTION, CocoError, CocoWriter
 from calibslam_sim.rendering.kernels import cast, cast_shadows, visible_parts
 from calibslam_sim.rendering.looks import FAMILIAR, FAMILIES, FOREIGN, looks
-from calibslam_sim.rendering.render import SAME_EDGE, Renderer
+from calibslam_sim.rendering.render import SAME_EDGE, RenderedImage, Renderer
 from calibslam_sim.simulation.camera_path import START, camera_path
 from calibslam_sim.simulation.recording import CAMERA
 from calibslam_sim.simulation.world import desk_world
@@ -166,6 +167,15 @@ def test_a_bag_holds_the_images_and_a_folder_their_boxes(tmp_path: Path) -> None
     assert clear and all(a["visible_share"] >= 0.3 and min(a["bbox"][2:]) >= 8.0 for a in clear)
     # The bag is there already; neither it nor the data set is touched.
     assert simulate.main(arguments) == 1
+    # Nor where only the bag is refused.
+    (bag / "mine.txt").touch()
+    assert simulate.main([*arguments, "--overwrite"]) == 1
+    assert sorted((coco / "images").iterdir()) == files and (coco / "annotations.json").exists()
+    other = tmp_path / "other"
+    assert simulate.main([*arguments, "--coco", str(other)]) == 1
+    assert not other.exists()
+    with pytest.raises(SystemExit):
+        simulate.main([*arguments, "--out", str(other), "--coco", str(other / "coco")])
 
 
 def test_a_data_set_of_several_worlds(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -178,6 +188,64 @@ def test_a_data_set_of_several_worlds(tmp_path: Path, capsys: pytest.CaptureFixt
     assert render_dataset.main([*arguments, "--overwrite"]) == 0
     (tmp_path / "d" / "mine.txt").touch()
     assert render_dataset.main([*arguments, "--overwrite"]) == 1
+
+
+def listed(folder: Path) -> list[str]:
+    return sorted(str(path.relative_to(folder)) for path in folder.rglob("*"))
+
+
+@pytest.mark.parametrize(
+    "files",
+    [
+        {"images/holiday/me.png": ""},
+        {"images/me.png": ""},
+        {"images": ""},
+        {"annotations.json": '{"info": {"description": "mine"}, "images": []}', "images/a.jpg": ""},
+        {"annotations.json": '{"images": [{"file_name": "a.jpg"}]}', "images/a.jpg": ""},
+        {"annotations.json": "[", "images/a.jpg": ""},
+        {"annotations.json": f'{{"info": {{"description": "{DESCRIPTION}"}}, "images": [{{"file_name": "b"}}]}}',
+         "images/b": "", "images/c": ""},
+    ],
+)  # fmt: skip
+def test_only_data_sets_of_ours_are_replaced(files: dict[str, str], tmp_path: Path) -> None:
+    for name, content in files.items():
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_text(content)
+    before = listed(tmp_path)
+    with pytest.raises(CocoError, match=f"{tmp_path} is not overwritten"):
+        CocoWriter(tmp_path, overwrite=True)
+    assert listed(tmp_path) == before
+
+
+def test_a_data_set_is_replaced_when_there_is_another(tmp_path: Path) -> None:
+    options = ["--out", str(tmp_path / "d"), "--worlds", "1"]
+    assert render_dataset.main([*options, "--images-per-world", "2"]) == 0
+    before = listed(tmp_path)
+    assert CocoWriter(tmp_path / "d", overwrite=True).close() == 0
+    assert listed(tmp_path) == before
+    assert render_dataset.main([*options, "--images-per-world", "1", "--overwrite"]) == 0
+    assert listed(tmp_path / "d") == ["annotations.json", "images", "images/000001.jpg"]
+
+
+@pytest.mark.parametrize("ending", [KeyboardInterrupt, OSError])
+def test_images_have_annotations_also_when_it_was_interrupted(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, ending: type[BaseException]
+) -> None:
+    render, done = Renderer.render, []
+
+    def interrupted(self: Renderer, time: int) -> RenderedImage:
+        if len(done) == 2:
+            raise ending
+        done.append(time)
+        return render(self, time)
+
+    monkeypatch.setattr(Renderer, "render", interrupted)
+    options = ["--out", str(tmp_path / "d"), "--worlds", "1", "--images-per-world", "3"]
+    with contextlib.suppress(OSError):
+        assert render_dataset.main(options) == 130
+    content = json.loads((tmp_path / "d" / "annotations.json").read_text())
+    assert [image["file_name"] for image in content["images"]] == ["000001.jpg", "000002.jpg"]
+    assert {annotation["image_id"] for annotation in content["annotations"]} == {1, 2}
 
 
 def test_coco_without_images_is_refused(tmp_path: Path) -> None:
