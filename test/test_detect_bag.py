@@ -105,17 +105,23 @@ def test_images_that_cannot_be_decoded_are_left_out_and_counted(tmp_path: Path) 
     types = bags.types
     image = types("sensor_msgs/msg/Image")
     with BagWriter(tmp_path / "bag") as bag:
-        for stamp, encoding in ((10, "16UC1"), (20, "bgr8")):
-            data = types.octets(bytes(120 * 160 * 3))
+        for stamp, encoding, height, width in (
+            (10, "16UC1", 120, 160),
+            (20, "bgr8", 120, 160),
+            (30, "yuv422", 120, 161),
+            (40, "mono8", 1, 1000),
+            (50, "mono8", 5000, 3),
+        ):
+            data = types.octets(bytes(height * width * 3))
             header = header_to_msg(stamp, "camera", types)
             message = image(
-                header=header, height=120, width=160, encoding=encoding, is_bigendian=0, step=480, data=data
+                header=header, height=height, width=width, encoding=encoding, is_bigendian=0, step=3 * width, data=data
             )
             bag.write("/camera/image_raw", message, stamp)
     detector = Detector.from_file(SHIPPED, DetectorSettings(device="cpu"))
     settings = detect_bag.DetectBagSettings()
     done = detect_bag.detect_bag(tmp_path / "bag", tmp_path / "out", detector, settings, overwrite=False)
-    assert done.images == 1 and done.left_out == {"image: encoding": 1}
+    assert done.images == 1 and done.left_out == {"image: encoding": 1, "image: image_size": 3}
     assert done.strange == 1  # black images are not what it has learnt from
     assert [time for time, _ in boxes_in(tmp_path / "out")] == [20]
 

@@ -89,11 +89,11 @@ def detect_bag(bag: Path, out: Path, detector: Detector, settings: DetectBagSett
                 progress.update()
                 try:
                     image = decode_image(content)
+                    stamp, frame_id = stamp_from_msg(content.header.stamp), str(content.header.frame_id)
+                    boxes, strangeness = detector(image, stamp, frame_id)
                 except InvalidMeasurement as error:
                     left_out[f"image: {error.reason}"] += 1
                     continue
-                stamp, frame_id = stamp_from_msg(content.header.stamp), str(content.header.frame_id)
-                boxes, strangeness = detector(image, stamp, frame_id)
                 boxes, rejected = valid_boxes(boxes)
                 left_out.update({f"box: {reason}": count for reason, count in rejected.items()})
                 writer.write(settings.topic, boxes_to_msg(boxes, bags.types), time)

@@ -28,7 +28,7 @@ from calibslam_detector.model.detector import Detector, DetectorSettings, Device
 from calibslam_detector.model.weights_file import SHIPPED, WeightsError
 from calibslam_detector.training.matching import free_of_border, match
 from calibslam_msgs_py.command import command
-from calibslam_msgs_py.measurements import Array, Boxes
+from calibslam_msgs_py.measurements import Array, Boxes, InvalidMeasurement
 from calibslam_msgs_py.settings import Settings, add_arguments, from_arguments, setting
 
 LEAST_SCORE = 0.05  # of boxes that count for the precision, as torchvision has it
@@ -57,7 +57,9 @@ class Errors:
 
 
 def detect_all(detector: Detector, data: CocoData) -> tuple[list[Boxes | None], float]:
-    """Boxes of each image, None where a file is no image; and the share of images with a strangeness above 1."""
+    """Boxes of each image, None where a file is no image to detect on; and the share of images with a strangeness
+    above 1.
+    """
     found: list[Boxes | None] = []
     strangeness = []
     for truth in tqdm(data.images, desc="detecting", unit="image"):
@@ -65,7 +67,11 @@ def detect_all(detector: Detector, data: CocoData) -> tuple[list[Boxes | None], 
         if image is None:
             found.append(None)
             continue
-        boxes, strange = detector(image)
+        try:
+            boxes, strange = detector(image)
+        except InvalidMeasurement:
+            found.append(None)
+            continue
         found.append(boxes)
         strangeness.append(strange)
     return found, float(np.mean(np.array(strangeness) > 1.0)) if strangeness else 0.0
@@ -196,7 +202,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     for name, value in result.items():
         print(f"{name:16s} {value:.4g}")
     if unreadable := sum(boxes is None for boxes in found):
-        print(f"left out: image that cannot be read ({unreadable})")
+        print(f"left out: image that cannot be read, or is too narrow ({unreadable})")
     return 0
 
 

@@ -8,8 +8,8 @@ import cv2
 import numpy as np
 import pytest
 
-from calibslam_detector.evaluate_detector import SUM, Errors, calibration_metrics, errors_of_whole_objects, precision
-from calibslam_detector.images.coco_data import CocoData, ImageTruth
+from calibslam_detector.evaluate_detector import SUM, Errors, calibration_metrics, detect_all, errors_of_whole_objects, precision
+from calibslam_detector.images.coco_data import CocoData, ImageTruth, read_image
 from calibslam_detector.images.image_conversion import ENCODINGS, decode_compressed, decode_raw, encode_jpeg
 from calibslam_detector.images.overlay import class_colour, draw_overlay, ellipse_axes
 from calibslam_detector.training.matching import free_of_border, match, overlaps
@@ -71,7 +71,7 @@ def test_yuv_becomes_rgb() -> None:
 @pytest.mark.parametrize(
     ("size", "encoding", "reason"),
     [((3, 4, 12), "16UC1", "encoding"), ((3, 4, 11), "rgb8", "image_size"), ((9, 4, 12), "rgb8", "image_size"),
-     ((0, 4, 12), "rgb8", "image_size")],
+     ((0, 4, 12), "rgb8", "image_size"), ((4, 3, 6), "yuv422", "image_size"), ((1, 1, 2), "yuv422_yuy2", "image_size")],
 )  # fmt: skip
 def test_an_image_that_is_none_is_refused(size: tuple[int, int, int], encoding: str, reason: str) -> None:
     with pytest.raises(InvalidMeasurement) as error:
@@ -88,6 +88,19 @@ def test_files_are_decoded_or_refused() -> None:
     for data in (b"", b"no image", encode_jpeg(image, 95)[:20]):
         with pytest.raises(InvalidMeasurement, match="no image that can be decoded"):
             decode_compressed(np.frombuffer(data, np.uint8))
+
+
+def test_images_are_as_they_are_stored(tmp_path: Path) -> None:
+    """COCO's boxes and a camera's calibration are of the stored rows, whichever side EXIF calls up."""
+    jpeg = encode_jpeg(np.full((16, 24, 3), RED[::-1], np.uint8), 95)
+    quarter_turn = b"II*\0\x08\0\0\0\x01\0\x12\x01\x03\0\x01\0\0\0\x06\0\0\0\0\0\0\0"
+    exif = b"Exif\0\0" + quarter_turn
+    turned = jpeg[:2] + b"\xff\xe1" + (len(exif) + 2).to_bytes(2, "big") + exif + jpeg[2:]
+    assert cv2.imdecode(np.frombuffer(turned, np.uint8), cv2.IMREAD_COLOR).shape == (24, 16, 3)  # it can be seen
+    (tmp_path / "turned.jpg").write_bytes(turned)
+    image = read_image(tmp_path / "turned.jpg")
+    assert image is not None and image.shape == (16, 24, 3)
+    assert decode_compressed(np.frombuffer(turned, np.uint8)).shape == (16, 24, 3)
 
 
 # -- overlay ------------------------------------------------------------------------------------------------------
@@ -153,6 +166,15 @@ def truth(boxes: list[list[float]], crowd: list[bool]) -> CocoData:
     labels = np.ones(len(boxes), np.int64)
     image = ImageTruth(1, Path("1.png"), np.array(boxes), labels, np.array(crowd))
     return CocoData(Path("a.json"), ("cup",), (image,))
+
+
+def test_an_image_that_the_detector_refuses_is_left_out(tmp_path: Path) -> None:
+    def refuse(image: np.ndarray) -> tuple[Boxes, float]:
+        raise InvalidMeasurement("image_size", str(image.shape))
+
+    cv2.imwrite(str(tmp_path / "narrow.png"), np.zeros((500, 2, 3), np.uint8))
+    image = ImageTruth(1, tmp_path / "narrow.png", np.empty((0, 4)), np.empty(0, np.int64), np.empty(0, bool))
+    assert detect_all(refuse, CocoData(Path("a.json"), ("cup",), (image,))) == ([None], 0.0)
 
 
 def test_precision_of_known_boxes() -> None:

@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 from torch.utils.data import Dataset
 
+from calibslam_detector.images.image_conversion import AS_STORED
 from calibslam_msgs_py.measurements import Array
 
 # Which box of an annotation is learnt: COCO's, of the visible part, or that of the whole object inside the image,
@@ -147,8 +148,8 @@ def _box(annotation: Any, key: str, images: dict[int, Any], labels: dict[int, in
 
 
 def read_image(file: Path) -> np.ndarray | None:
-    """(H, W, 3) uint8 RGB; None where the file is no image."""
-    image = cv2.imread(str(file), cv2.IMREAD_COLOR)
+    """(H, W, 3) uint8 RGB, turned as it is stored, as COCO's boxes are; None where the file is no image."""
+    image = cv2.imread(str(file), AS_STORED)
     return None if image is None else np.ascontiguousarray(image[..., ::-1])
 
 

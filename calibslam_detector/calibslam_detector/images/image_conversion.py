@@ -34,6 +34,8 @@ DEPTH_ENCODINGS: dict[str, tuple[str, float]] = {
 }
 # What compressed_depth_image_transport writes before the PNG: the format and the two numbers of its quantisation.
 COMPRESSED_DEPTH_HEADER = 12  # bytes
+# Colour, and the rows as the camera wrote them: boxes and calibration are of these, whichever side EXIF calls up.
+AS_STORED = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
 OVERLAY_QUALITY = 85  # of JPEG
 
 
@@ -41,7 +43,8 @@ def decode_raw(data: np.ndarray, height: int, width: int, step: int, encoding: s
     """(H, W, 3) uint8 RGB of the bytes of a sensor_msgs/Image.
 
     Raises:
-        InvalidMeasurement: an encoding that is not of 8-bit colour or grey, or a size that does not fit the data.
+        InvalidMeasurement: an encoding that is not of 8-bit colour or grey, or a size that does not fit the data or the
+            encoding.
     """
     if encoding not in ENCODINGS:
         raise InvalidMeasurement("encoding", f"image encoding '{encoding}'; known: {', '.join(ENCODINGS)}")
@@ -52,7 +55,12 @@ def decode_raw(data: np.ndarray, height: int, width: int, step: int, encoding: s
         )
     rows = data[: height * step].reshape(height, step)[:, : width * channels]
     pixels = np.ascontiguousarray(rows.reshape(height, width, channels) if channels > 1 else rows)
-    return pixels if conversion is None else np.asarray(cv2.cvtColor(pixels, conversion))
+    try:
+        return pixels if conversion is None else np.asarray(cv2.cvtColor(pixels, conversion))
+    except cv2.error:  # two pixels of yuv422 share their colour
+        raise InvalidMeasurement(
+            "image_size", f"image of {width} x {height} pixels, which is none of encoding '{encoding}'"
+        ) from None
 
 
 def decode_compressed(data: np.ndarray) -> np.ndarray:
@@ -62,7 +70,7 @@ def decode_compressed(data: np.ndarray) -> np.ndarray:
         InvalidMeasurement: it is none, or damaged.
     """
     try:
-        image = cv2.imdecode(data, cv2.IMREAD_COLOR) if data.size else None
+        image = cv2.imdecode(data, AS_STORED) if data.size else None
     except cv2.error:
         image = None
     if image is None:

@@ -13,9 +13,11 @@ from calibslam_detector.images.coco_data import to_tensor
 from calibslam_detector.model import weights_file
 from calibslam_detector.model.network import CalibratedDetector
 from calibslam_msgs_py.covariance import symmetric
-from calibslam_msgs_py.measurements import Boxes
+from calibslam_msgs_py.measurements import Boxes, InvalidMeasurement
 from calibslam_msgs_py.settings import Settings, setting
 
+# [px of the network's input] of an image's shorter side; torchvision cannot resize to less than one.
+LEAST_SIDE = 2.0
 DEVICES = ("auto", "cpu", "cuda")
 
 
@@ -66,7 +68,16 @@ class Detector:
     def __call__(self, image: np.ndarray, stamp: int = 0, frame_id: str = "camera") -> tuple[Boxes, float]:
         """Boxes, the best first, of an image (H, W, 3) uint8 RGB that was taken at `stamp` [ns], and how strange it is:
         covariances are calibrated for images like those learnt from, of which 95 % have a strangeness below 1.
+
+        Raises:
+            InvalidMeasurement: an image so long and narrow that nothing would be left of it.
         """
+        short, long = sorted(image.shape[:2])
+        resizing = self._model.detector.transform
+        if short * min(resizing.min_size[-1] / short, resizing.max_size / long) < LEAST_SIDE:
+            raise InvalidMeasurement(
+                "image_size", f"image of {image.shape[1]} x {image.shape[0]} pixels, too narrow to detect anything"
+            )
         with torch.inference_mode():
             (found,) = self._model.detect([to_tensor(image).to(self.device)])
         covariances = found["covariances"].double().cpu().numpy()
