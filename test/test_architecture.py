@@ -57,6 +57,11 @@ def test_imports(file: Path) -> None:
         assert not ros, f"only *_node.py may import {ros}"
 
 
+@pytest.mark.parametrize("file", MODULES, ids=lambda file: f"{file.parent.name}/{file.name}")
+def test_no_command_takes_abbreviations(file: Path) -> None:
+    assert "argparse.ArgumentParser(" not in file.read_text(), "calibslam_msgs_py.command has one without them"
+
+
 @pytest.mark.parametrize("package", PACKAGES)
 def test_folders_know_each_other_in_one_direction(package: str) -> None:
     root = PROJECT / package / package

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import dataclasses
 import logging
 import sys
@@ -21,7 +20,7 @@ from calibslam_backend.output.run_folder import RunRecord, write_run
 from calibslam_backend.recording import BOXES, CAMERA, MOTIONS, NAMEABLE, ODOMETRY, RAW_BOXES, Recording
 from calibslam_msgs_py import bags
 from calibslam_msgs_py.bags import BagError, BagReader, BagWriter, refuse_to_replace
-from calibslam_msgs_py.command import command
+from calibslam_msgs_py.command import ArgumentParser, command
 from calibslam_msgs_py.measurements import SECOND, Boxes, InvalidMeasurement
 from calibslam_msgs_py.settings import SettingsError, add_arguments, from_arguments
 
@@ -31,7 +30,7 @@ MAP_PERIOD = 5.0  # [s] of recorded time between two maps in run.mcap
 @command
 def main(arguments: Sequence[str] | None = None) -> int:
     """Entry of the executable; returns the exit code."""
-    parser = argparse.ArgumentParser(prog="slam_bag", description=__doc__)
+    parser = ArgumentParser(prog="slam_bag", description=__doc__)
     parser.add_argument("bag", help="rosbag2 folder or .mcap file with boxes, odometry and camera_info")
     parser.add_argument(
         "--out",
@@ -62,7 +61,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         metrics = slam_bag(
             parsed.bag, parsed.out, settings, parsed.calibrator, parsed.batch, parsed.camera_in_body, parsed.map, named
         )
-    except (BagError, SettingsError, ValueError, OSError) as error:
+    except (BagError, SettingsError, ValueError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 1
     if not metrics["keyframes"]:

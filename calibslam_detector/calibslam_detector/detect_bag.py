@@ -24,7 +24,7 @@ from calibslam_detector.model.detector import Detector, DetectorSettings, Device
 from calibslam_detector.model.weights_file import SHIPPED, WeightsError
 from calibslam_msgs_py import bags
 from calibslam_msgs_py.bags import BagError, BagReader, BagWriter, refuse_to_replace
-from calibslam_msgs_py.command import command
+from calibslam_msgs_py.command import ArgumentParser, command
 from calibslam_msgs_py.conversions import boxes_to_msg, header_to_msg, stamp_from_msg, valid_boxes
 from calibslam_msgs_py.measurements import Boxes, InvalidMeasurement
 from calibslam_msgs_py.settings import Settings, SettingsError, add_arguments, from_arguments, setting
@@ -153,7 +153,7 @@ def _overlay(image: np.ndarray, boxes: Boxes) -> Any:
 @command
 def main(argv: Sequence[str] | None = None) -> int:
     """Command line of `detect_bag`; returns the exit code."""
-    parser = argparse.ArgumentParser(
+    parser = ArgumentParser(
         prog="detect_bag", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("bag", type=Path, metavar="BAG", help="rosbag2 folder or .mcap file with images")
@@ -177,7 +177,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         settings = from_arguments(arguments, DetectBagSettings)
         detector = Detector.from_file(arguments.weights, from_arguments(arguments, DetectorSettings))
         done = detect_bag(arguments.bag, arguments.out, detector, settings, arguments.overwrite)
-    except (BagError, WeightsError, DeviceError, SettingsError, OSError) as error:
+    except (BagError, WeightsError, DeviceError, SettingsError) as error:
         print(f"detect_bag: {error}", file=sys.stderr)
         return 1
     except KeyboardInterrupt:

@@ -6,7 +6,6 @@ edge has no error.
 
 from __future__ import annotations
 
-import argparse
 import contextlib
 import io
 import json
@@ -27,7 +26,7 @@ from calibslam_detector.images.coco_data import BOX_KEYS, CocoData, DataError, l
 from calibslam_detector.model.detector import Detector, DetectorSettings, DeviceError
 from calibslam_detector.model.weights_file import SHIPPED, WeightsError
 from calibslam_detector.training.matching import free_of_border, match
-from calibslam_msgs_py.command import command
+from calibslam_msgs_py.command import ArgumentParser, command
 from calibslam_msgs_py.measurements import Array, Boxes, InvalidMeasurement
 from calibslam_msgs_py.settings import Settings, add_arguments, from_arguments, setting
 
@@ -166,7 +165,7 @@ def _as_coco(data: CocoData) -> dict[str, Any]:
 @command
 def main(argv: Sequence[str] | None = None) -> int:
     """Command line of `evaluate_detector`; returns the exit code."""
-    parser = argparse.ArgumentParser(prog="evaluate_detector", description=__doc__)
+    parser = ArgumentParser(prog="evaluate_detector", description=__doc__)
     parser.add_argument("data", type=Path, metavar="DIR", help="annotations.json and images/")
     parser.add_argument(
         "--weights",

@@ -5,7 +5,6 @@ Labels are not needed: reference boxes are reprojections of quadrics that were f
 
 from __future__ import annotations
 
-import argparse
 import json
 import sys
 from collections.abc import Sequence
@@ -24,7 +23,7 @@ from calibslam_detector.foreign_boxes.edge_mixture import EdgeMixture, fit_mixtu
 from calibslam_detector.foreign_boxes.features import FEATURES, edge_features
 from calibslam_detector.foreign_boxes.log_linear import LogLinearCalibrator
 from calibslam_msgs_py.bags import BagError, refuse_to_replace
-from calibslam_msgs_py.command import command
+from calibslam_msgs_py.command import ArgumentParser, command
 from calibslam_msgs_py.measurements import Array, Boxes
 from calibslam_msgs_py.settings import SettingsError, settings_fields
 
@@ -205,7 +204,7 @@ def references(bag: str) -> Sequence[ReferencedImage]:
 @command
 def main(arguments: Sequence[str] | None = None) -> int:
     """Entry of the executable; returns the exit code."""
-    parser = argparse.ArgumentParser(prog="fit_calibrator", description=__doc__)
+    parser = ArgumentParser(prog="fit_calibrator", description=__doc__)
     parser.add_argument("bag", help="recording with boxes, camera_info, odometry and ground_truth")
     parser.add_argument("--out", required=True, type=Path, metavar="FILE", help="calibrator file to write (JSON)")
     parser.add_argument("--test", metavar="BAG", help="another recording, to judge the result on")
@@ -237,7 +236,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             "fitted_on": fitted_on,
         }
         parsed.out.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
-    except (BagError, CalibratorError, OSError) as error:
+    except (BagError, CalibratorError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 1
     print(f"{len(edges.errors)} edges of {fitted_on['objects']} objects; calibrator: {parsed.out}")

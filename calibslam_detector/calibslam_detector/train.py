@@ -26,7 +26,7 @@ from calibslam_detector.model.weights_file import WeightsError
 from calibslam_detector.training.covariance_task import LOSSES, covariance_task, find_examples, stored_examples
 from calibslam_detector.training.detector_task import Processes, detector_task
 from calibslam_detector.training.training_loop import Interrupted, LoopSettings, TrainingError, optimise
-from calibslam_msgs_py.command import command
+from calibslam_msgs_py.command import ArgumentParser, command
 from calibslam_msgs_py.settings import Settings, add_arguments, from_arguments, setting
 
 MIN_EXAMPLES = 500  # of the covariance head; a fifth of them are held out, and two sums of f-Cal need 50
@@ -68,7 +68,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _arguments(argv: Sequence[str] | None) -> argparse.Namespace:
-    parser = argparse.ArgumentParser(prog="train", description=__doc__)
+    parser = ArgumentParser(prog="train", description=__doc__)
     parser.add_argument("data", type=Path, metavar="DIR", help="annotations.json and images/; or see --annotations")
     parser.add_argument("--annotations", type=Path, metavar="FILE", help="COCO json (default: DIR/annotations.json)")
     parser.add_argument("--images", type=Path, metavar="DIR", help="images (default: DIR/images)")

@@ -8,7 +8,14 @@ import cv2
 import numpy as np
 import pytest
 
-from calibslam_detector.evaluate_detector import SUM, Errors, calibration_metrics, detect_all, errors_of_whole_objects, precision
+from calibslam_detector.evaluate_detector import (
+    SUM,
+    Errors,
+    calibration_metrics,
+    detect_all,
+    errors_of_whole_objects,
+    precision,
+)
 from calibslam_detector.images.coco_data import CocoData, ImageTruth, read_image
 from calibslam_detector.images.image_conversion import ENCODINGS, decode_compressed, decode_raw, encode_jpeg
 from calibslam_detector.images.overlay import class_colour, draw_overlay, ellipse_axes

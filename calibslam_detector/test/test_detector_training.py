@@ -16,6 +16,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from full_disk import full_disk
 
 from calibslam_detector import evaluate_detector, train
 from calibslam_detector.images.coco_data import CocoData, DataError, ImageTruth, TrainingImages, load_coco_data
@@ -202,6 +203,26 @@ def test_a_run_folder_is_not_overwritten(data: Path, tmp_path: Path, capsys: pyt
     assert "exists already: choose another folder" in capsys.readouterr().err
     assert train.main([str(data), "--out", str(tmp_path), "--resume"]) == 1
     assert "no checkpoint" in capsys.readouterr().err
+
+
+def test_a_run_folder_that_cannot_be_written_is_said(
+    data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "file").touch()
+    run = tmp_path / "file" / "run"
+    for main, name in ((train.main, "train"), (evaluate_detector.main, "evaluate_detector")):
+        assert main([str(data), "--out", str(run), "--boxes", "bbox"]) == 1
+        assert f"{name}: {run}: Not a directory; choose another path" in capsys.readouterr().err
+
+
+def test_a_full_disk_leaves_the_old_file_alone(tmp_path: Path) -> None:
+    content = {"a": torch.zeros(1_000_000)}
+    path = tmp_path / "checkpoint.pt"
+    path.write_bytes(b"old")
+    with full_disk(100_000), pytest.raises(OSError, match="File too large") as error:
+        weights_file.write_safely(content, path)
+    assert error.value.filename == str(path)
+    assert path.read_bytes() == b"old" and list(tmp_path.iterdir()) == [path]
 
 
 def test_a_loss_that_is_not_finite_ends_training_with_the_last_good_state(tmp_path: Path) -> None:

@@ -1,11 +1,10 @@
 """Bags: what is written is read, by others too; what is broken is said."""
 
-import resource
-import signal
 from pathlib import Path
 
 import numpy as np
 import pytest
+from full_disk import full_disk
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 
@@ -246,15 +245,8 @@ def test_a_failed_write_leaves_the_old_bag_alone(tmp_path: Path, name: str, endi
 @pytest.mark.parametrize("name", ["bag", "run.mcap"])
 def test_a_full_disk_is_said_and_leaves_the_old_bag_alone(tmp_path: Path, name: str) -> None:
     path = write(tmp_path / name, n=2)
-    before = resource.getrlimit(resource.RLIMIT_FSIZE)
-    handler = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
-    try:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (512, before[1]))
-        with pytest.raises(BagError, match=rf"cannot write .*{name}: File too large; make room"):
-            write(path, n=20, overwrite=True)
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, before)
-        signal.signal(signal.SIGXFSZ, handler)
+    with full_disk(512), pytest.raises(BagError, match=rf"cannot write .*{name}: File too large; make room"):
+        write(path, n=20, overwrite=True)
     assert list(tmp_path.iterdir()) == [path]
     with BagReader(path) as bag:
         assert bag.counts["/detections"] == 2

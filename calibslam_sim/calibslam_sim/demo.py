@@ -23,7 +23,7 @@ from typing import Any
 from calibslam_backend.kernels import load_kernels
 from calibslam_backend.output.object_map import ObjectMap
 from calibslam_msgs_py.bags import BagError, BagReader
-from calibslam_msgs_py.command import command
+from calibslam_msgs_py.command import ArgumentParser, command
 from calibslam_sim import demo_images, topics
 from calibslam_sim.accuracy.reference import read_reference
 from calibslam_sim.evaluate import evaluate, found_objects
@@ -182,9 +182,7 @@ def table(results: dict[str, dict[str, Any]]) -> str:
 @command
 def main(argv: Sequence[str] | None = None) -> int:
     """Command line of `demo`; returns the exit code."""
-    parser = argparse.ArgumentParser(
-        prog="demo", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = ArgumentParser(prog="demo", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument(
         "--out", type=Path, default=Path("calibslam_demo"), help="folder to write (default: ./calibslam_demo)"
     )
@@ -230,7 +228,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         print("demo: interrupted", file=sys.stderr)
         return 130
-    except (ProcessFailed, BagError, ValueError, OSError) as error:
+    except (ProcessFailed, BagError, ValueError) as error:
         print(f"demo: {error}", file=sys.stderr)
         return 1
     say("done")

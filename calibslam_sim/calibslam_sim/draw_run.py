@@ -20,7 +20,7 @@ from calibslam_backend.recording import Recording
 from calibslam_detector.images.image_conversion import decode_image, encode_jpeg
 from calibslam_detector.images.overlay import class_colour, draw_label, draw_overlay
 from calibslam_msgs_py.bags import BagError, BagReader
-from calibslam_msgs_py.command import command
+from calibslam_msgs_py.command import ArgumentParser, command
 from calibslam_msgs_py.conversions import stamp_from_msg
 from calibslam_msgs_py.measurements import SECOND, Array, Boxes, Camera, InvalidMeasurement
 from calibslam_sim import topics
@@ -122,9 +122,7 @@ def draw_run(run: Path, recording: Recording, bag_path: Path, out: Path) -> int:
 @command
 def main(argv: Sequence[str] | None = None) -> int:
     """Command line of `draw_run`; returns the exit code."""
-    parser = argparse.ArgumentParser(
-        prog="draw_run", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = ArgumentParser(prog="draw_run", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("run", type=Path, metavar="RUN", help="folder that slam_bag wrote")
     parser.add_argument("bag", type=Path, metavar="BAG", help="recording with the images")
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder for the pictures")

@@ -23,7 +23,7 @@ from calibslam_backend.output.metrics import NoGroundTruth, Trajectory, alignmen
 from calibslam_backend.output.object_map import MapFileError, ObjectMap, tum_lines
 from calibslam_backend.output.plots import plot_run
 from calibslam_backend.output.run_folder import accuracy
-from calibslam_msgs_py.command import command
+from calibslam_msgs_py.command import ArgumentParser, command
 from calibslam_msgs_py.measurements import Array, RelativeMotion
 from calibslam_sim.accuracy.objects import map_objects, object_accuracy
 from calibslam_sim.accuracy.reference import NoReference, Reference, read_reference
@@ -126,7 +126,7 @@ def _row(name: str, metrics: dict[str, Any], key: str, style: str) -> str:
 @command
 def main(argv: Sequence[str] | None = None) -> int:
     """Command line of `evaluate`; returns the exit code."""
-    parser = argparse.ArgumentParser(
+    parser = ArgumentParser(
         prog="evaluate", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("run", type=Path, metavar="RUN", help="folder that slam_bag wrote, or a map file")

@@ -13,7 +13,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from calibslam_msgs_py.command import command
+from calibslam_msgs_py.command import ArgumentParser, command
 from calibslam_msgs_py.settings import SettingsError, add_arguments, from_arguments
 from calibslam_sim.experiments.design import Experiment, ExperimentError, ExperimentSettings
 from calibslam_sim.experiments.engine import run
@@ -57,7 +57,7 @@ def perform(
 
 def _name(arguments: Sequence[str]) -> str:
     """The experiment that the first argument names."""
-    parser = argparse.ArgumentParser(
+    parser = ArgumentParser(
         prog="experiment",
         usage="experiment NAME --out DIR [--quick] [options]",
         description=__doc__,
@@ -70,7 +70,7 @@ def _name(arguments: Sequence[str]) -> str:
 
 def _parser(name: str, experiment: Experiment, is_quick: bool) -> argparse.ArgumentParser:
     """The options of an experiment, with its defaults or the quick ones."""
-    parser = argparse.ArgumentParser(
+    parser = ArgumentParser(
         prog=f"experiment {name}",
         description=f"{experiment.title}\n\n{__doc__}",
         formatter_class=argparse.RawDescriptionHelpFormatter,
@@ -79,7 +79,7 @@ def _parser(name: str, experiment: Experiment, is_quick: bool) -> argparse.Argum
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder of the result")
     parser.add_argument("--quick", action="store_true", help="reduced sizes: whether it runs, not what is true")
     parser.add_argument("--seeds", type=_positive, default=repetitions, help="repetitions (default: %(default)s)")
-    parser.add_argument("--jobs", type=int, default=-1, help="processes (default: one for each core)")
+    parser.add_argument("--jobs", type=_jobs, default=-1, help="processes (default: one for each core)")
     parser.add_argument(
         "--backend",
         default="loky",
@@ -99,6 +99,13 @@ def _positive(text: str) -> int:
     number = int(text)
     if number < 1:
         raise argparse.ArgumentTypeError("must be at least 1")
+    return number
+
+
+def _jobs(text: str) -> int:
+    number = int(text)
+    if number == 0:
+        raise argparse.ArgumentTypeError("must be at least 1, or -1 for one for each core")
     return number
 
 
@@ -125,7 +132,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         print("experiment: interrupted; the same command goes on where it stopped", file=sys.stderr)
         return 130
-    except (ExperimentError, SettingsError, OSError) as error:
+    except (ExperimentError, SettingsError) as error:
         print(f"experiment: {error}", file=sys.stderr)
         return 1
     print(f"{experiment.title}\n\n{table(result, experiment.metrics)}\n")

@@ -17,7 +17,7 @@ from calibslam_backend.recording import CAMERA
 from calibslam_detector.images.image_conversion import decode_image
 from calibslam_detector.images.overlay import class_colour
 from calibslam_msgs_py.bags import BagError, BagReader
-from calibslam_msgs_py.command import command
+from calibslam_msgs_py.command import ArgumentParser, command
 from calibslam_msgs_py.conversions import camera_from_msg, stamp_from_msg
 from calibslam_msgs_py.geometry_conversions import quaternion_from_rotation
 from calibslam_msgs_py.measurements import SECOND, InvalidMeasurement
@@ -89,7 +89,7 @@ def _log_images(rerun: Any, path: Path) -> None:
 @command
 def main(argv: Sequence[str] | None = None) -> int:
     """Command line of `export_rerun`; returns the exit code."""
-    parser = argparse.ArgumentParser(
+    parser = ArgumentParser(
         prog="export_rerun", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("run", type=Path, metavar="RUN", help="folder that slam_bag wrote")

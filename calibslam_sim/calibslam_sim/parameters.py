@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import argparse
 import importlib
 import sys
 from collections.abc import Sequence
 from importlib.metadata import entry_points
 from pathlib import Path
 
-from calibslam_msgs_py.command import command
+from calibslam_msgs_py.command import ArgumentParser, command
 from calibslam_msgs_py.parameter_files import NodeParameters, markdown_text, yaml_text
 
 COMMAND = "./calibslam run calibslam_sim parameters"
@@ -38,7 +37,7 @@ def files() -> dict[Path, str]:
 @command
 def main(arguments: Sequence[str] | None = None) -> int:
     """Entry of the executable; returns the exit code."""
-    parser = argparse.ArgumentParser(prog="parameters", description=__doc__)
+    parser = ArgumentParser(prog="parameters", description=__doc__)
     parser.add_argument("--project", type=Path, default=Path(), metavar="DIR", help="the source tree (default: .)")
     project: Path = parser.parse_args(arguments).project
     if not (project / "calibslam_backend" / "package.xml").exists():

@@ -23,6 +23,7 @@ from rclpy.utilities import remove_ros_args
 from rosgraph_msgs.msg import Clock
 
 from calibslam_msgs_py.bags import BagError, BagReader
+from calibslam_msgs_py.command import ArgumentParser
 from calibslam_msgs_py.conversions import RosTypes, stamp_to_msg
 from calibslam_msgs_py.node import LATCHED
 from calibslam_sim.progress import Progress
@@ -163,9 +164,7 @@ def main(args: Sequence[str] | None = None) -> int:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog="play", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = ArgumentParser(prog="play", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("bag", type=Path, metavar="BAG", help="rosbag2 folder or .mcap file")
     parser.add_argument("--rate", type=_positive, default=1.0, help="times real time (default: 1)")
     parser.add_argument(

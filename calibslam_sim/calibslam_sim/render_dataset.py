@@ -5,7 +5,6 @@ Every world has its own seed, layout, textures, light and camera; its images are
 
 from __future__ import annotations
 
-import argparse
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -13,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from calibslam_msgs_py.command import command
+from calibslam_msgs_py.command import ArgumentParser, command
 from calibslam_msgs_py.measurements import SECOND
 from calibslam_msgs_py.settings import Settings, add_arguments, from_arguments, setting
 from calibslam_sim.progress import Progress
@@ -57,7 +56,7 @@ def render_dataset(settings: DatasetSettings, writer: CocoWriter) -> None:
 @command
 def main(argv: Sequence[str] | None = None) -> int:
     """Command line of `render_dataset`; returns the exit code."""
-    parser = argparse.ArgumentParser(prog="render_dataset", description=__doc__)
+    parser = ArgumentParser(prog="render_dataset", description=__doc__)
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder to write")
     parser.add_argument("--overwrite", action="store_true", help="replace a data set that is there")
     add_arguments(parser, DatasetSettings)

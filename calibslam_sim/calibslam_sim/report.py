@@ -10,7 +10,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from calibslam_msgs_py.command import command
+from calibslam_msgs_py.command import ArgumentParser, command
 from calibslam_sim.run_report.loading import ReportError, load_runs
 from calibslam_sim.run_report.page import missing, page
 
@@ -20,9 +20,7 @@ MEGABYTE = 1e6
 @command
 def main(argv: Sequence[str] | None = None) -> int:
     """Command line of `report`; returns the exit code."""
-    parser = argparse.ArgumentParser(
-        prog="report", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = ArgumentParser(prog="report", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("runs", type=Path, nargs="+", metavar="RUN", help="folders that slam_bag wrote")
     parser.add_argument(
         "--out", type=Path, metavar="FILE", help="page to write (default: report.html in the first RUN)"
@@ -35,7 +33,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         runs = load_runs(arguments.runs, arguments.recording, arguments.calibrator)
         text = page(runs)
         out.write_text(text, encoding="utf-8")
-    except (ReportError, OSError) as error:
+    except ReportError as error:
         print(f"report: {error}", file=sys.stderr)
         return 1
     for run in runs:

@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from calibslam_msgs_py.command import command
+from calibslam_msgs_py.command import ArgumentParser, command
 from calibslam_sim.experiments.design import Experiment
 from calibslam_sim.experiments.outputs import mean_and_deviation, rows_of_conditions, rows_of_pairs
 from calibslam_sim.experiments.registry import MODULES, load
@@ -89,9 +89,7 @@ def _markdown(rows: Sequence[Sequence[str]]) -> str:
 @command
 def main(argv: Sequence[str] | None = None) -> int:
     """Command line of `results`; returns the exit code."""
-    parser = argparse.ArgumentParser(
-        prog="results", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = ArgumentParser(prog="results", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folders", type=Path, nargs="+", metavar="DIR", help="folders that `experiment` wrote")
     parser.add_argument("--into", type=Path, required=True, metavar="FILE", help="Markdown document with marks")
     arguments = parser.parse_args(argv)
@@ -100,7 +98,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         for folder in arguments.folders:
             result = read_result(folder)
             text = fill(text, folder.resolve().name, block(result, load(result["experiment"])))
-    except (ResultsError, OSError) as error:
+    except ResultsError as error:
         print(f"results: {error}", file=sys.stderr)
         return 1
     arguments.into.write_text(text, encoding="utf-8")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import signal
 import sys
 import time
@@ -13,6 +12,8 @@ import rclpy
 from calibslam_msgs.srv import SaveMap
 from rclpy.signals import SignalHandlerOptions
 from rclpy.utilities import remove_ros_args
+
+from calibslam_msgs_py.command import ArgumentParser
 
 
 class SaveError(Exception):
@@ -45,7 +46,7 @@ def save_map(backend: str, path: Path, timeout: float) -> str:
 
 def main(args: Sequence[str] | None = None) -> int:
     """Command line of `save_map`; returns the exit code."""
-    parser = argparse.ArgumentParser(prog="save_map", description=__doc__)
+    parser = ArgumentParser(prog="save_map", description=__doc__)
     parser.add_argument("path", type=Path, metavar="FILE", help="map file to write, e.g. run/map.json")
     parser.add_argument("--backend", default="/backend", metavar="NODE", help="(default: /backend)")
     parser.add_argument("--timeout", type=float, default=60.0, metavar="S", help="(default: 60)")

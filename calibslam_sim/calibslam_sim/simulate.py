@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import sys
 import time
 from collections.abc import Callable, Sequence
@@ -12,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from calibslam_msgs_py import bags
-from calibslam_msgs_py.command import command
+from calibslam_msgs_py.command import ArgumentParser, command
 from calibslam_msgs_py.conversions import (
     boxes_to_msg,
     camera_to_msg,
@@ -98,10 +97,10 @@ def _image(stamp: int, frame_id: str, image: RenderedImage) -> Any:
 def main(argv: Sequence[str] | None = None) -> int:
     """Command line of `simulate`; returns the exit code."""
     # The scenario decides the defaults of the other options.
-    first = argparse.ArgumentParser(add_help=False)
+    first = ArgumentParser(add_help=False)
     first.add_argument("--scenario", choices=sorted(SCENARIOS), default="desk", help=SCENARIO_HELP)
     scenario = first.parse_known_args(argv)[0].scenario
-    parser = argparse.ArgumentParser(prog="simulate", description=__doc__, parents=[first])
+    parser = ArgumentParser(prog="simulate", description=__doc__, parents=[first])
     parser.add_argument("--out", type=Path, required=True, metavar="BAG", help="folder to write")
     parser.add_argument("--overwrite", action="store_true", help="replace the bag if it exists")
     parser.add_argument("--images", action="store_true", help="render the images, too (about 0.1 s each)")

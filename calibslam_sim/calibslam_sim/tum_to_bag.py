@@ -17,7 +17,7 @@ import cv2
 import numpy as np
 
 from calibslam_msgs_py import bags
-from calibslam_msgs_py.command import command
+from calibslam_msgs_py.command import ArgumentParser, command
 from calibslam_msgs_py.conversions import boxes_to_msg, camera_to_msg, header_to_msg, stamped_pose_to_msg
 from calibslam_msgs_py.measurements import Boxes, Camera
 from calibslam_sim import topics
@@ -195,7 +195,7 @@ def convert(
 @command
 def main(argv: Sequence[str] | None = None) -> int:
     """Command line of `tum_to_bag`; returns the exit code."""
-    parser = argparse.ArgumentParser(
+    parser = ArgumentParser(
         prog="tum_to_bag", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("folder", type=Path, metavar="DIR", help="folder in the format of the TUM benchmark")

@@ -21,7 +21,7 @@ from calibslam_backend.output.metrics import NoGroundTruth, Trajectory, ate
 from calibslam_backend.recording import MOTIONS
 from calibslam_msgs_py import bags
 from calibslam_msgs_py.bags import BagError, BagReader, BagWriter, refuse_to_replace
-from calibslam_msgs_py.command import command
+from calibslam_msgs_py.command import ArgumentParser, command
 from calibslam_msgs_py.conversions import camera_from_msg, motion_to_msg, stamped_pose_from_msg
 from calibslam_msgs_py.measurements import Camera, InvalidMeasurement, RelativeMotion
 from calibslam_msgs_py.settings import SettingsError, add_arguments, from_arguments
@@ -171,7 +171,7 @@ def report(result: Result, truth: Trajectory | None) -> Iterator[str]:
 @command
 def main(argv: Sequence[str] | None = None) -> int:
     """Command line of `visual_odometry_bag`; returns the exit code."""
-    parser = argparse.ArgumentParser(
+    parser = ArgumentParser(
         prog="visual_odometry_bag", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("bag", type=Path, metavar="BAG", help="rosbag2 folder or .mcap file with images and depth")

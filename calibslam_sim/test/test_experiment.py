@@ -277,7 +277,9 @@ def test_a_bad_line_is_named(tmp_path: Path) -> None:
 
 
 def test_what_is_wrong_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    for arguments in (["nonsense", "--out", "x"], ["kalman", "--seeds", "0", "--out", "x"], ["kalman"], []):
+    wrong = (["--seeds", "0"], ["--jobs", "0"], ["--qui"])
+    out = ["--out", str(tmp_path / "x")]
+    for arguments in (["nonsense", *out], *(["kalman", *out, *w] for w in wrong), ["kalman"], []):
         with pytest.raises(SystemExit) as stop:
             experiment.main(arguments)
         assert stop.value.code == 2

@@ -67,10 +67,22 @@ def save_head(model: CalibratedDetector, path: Path) -> None:
 
 
 def write_safely(content: dict[str, Any], path: Path) -> None:
-    """Write with torch, so that the file is whole or as it was."""
+    """Write with torch, so that the file is whole or as it was.
+
+    Raises:
+        OSError: it cannot be written.
+    """
     part = path.with_name(f".{path.name}.part")
-    torch.save(content, part)
-    part.replace(path)
+    try:
+        with part.open("wb") as file:
+            torch.save(content, file)
+        part.replace(path)
+    except BaseException as error:
+        part.unlink(missing_ok=True)
+        reason = error.__context__
+        if isinstance(error, RuntimeError) and isinstance(reason, OSError):  # torch hides that the disk is full
+            raise OSError(reason.errno, reason.strerror, str(path)) from error
+        raise
 
 
 def load(path: Path = SHIPPED) -> CalibratedDetector:
