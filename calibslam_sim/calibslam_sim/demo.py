@@ -163,9 +163,10 @@ def table(results: dict[str, dict[str, Any]]) -> str:
     lines = [f"{'':34}{'ATE [m]':>9}{'RPE [m]':>9}{'NEES':>8}{'3-D IoU':>9}  objects"]
     for title, metrics in rows:
         objects = metrics.get("object_accuracy")
+        iou = f"{objects['iou']:9.2f}" if objects and objects["matched"] else f"{'-':>9}"
         lines.append(
             f"{title:34}{metrics['ate_m']:9.3f}{metrics['rpe_m']:9.4f}{metrics['nees_position']:8.2f}"
-            + (f"{objects['iou']:9.2f}  {found_objects(objects)}" if objects else "")
+            + (f"{iou}  {found_objects(objects)}" if objects else "")
         )
     lines += [
         "",

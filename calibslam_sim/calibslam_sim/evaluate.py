@@ -29,18 +29,24 @@ from calibslam_sim.accuracy.objects import map_objects, object_accuracy
 from calibslam_sim.accuracy.reference import NoReference, Reference, read_reference
 
 
+class MetricsError(ValueError):
+    """A metrics.json that cannot be used; the text names it and the next step."""
+
+
 def evaluate(run: Path, reference: Reference) -> dict[str, Any]:
     """Metrics of a RUN folder, or of a map file; writes metrics.json and the trajectory into the folder.
 
     Raises:
         MapFileError: the run has no readable map.json.
+        MetricsError: its metrics.json is damaged.
         NoGroundTruth: fewer than three keyframes have ground truth.
     """
     result = ObjectMap.load(run if run.is_file() else run / "map.json")
+    before = {} if run.is_file() else _metrics(run / "metrics.json")
     odometry = odometry_at(result, reference.motions)
     found = _measured(result, reference, odometry)
     if not run.is_file():
-        _write(run, result, reference, odometry, found)
+        _write(run, result, reference, odometry, {**before, **found})
     return found
 
 
@@ -53,7 +59,9 @@ def _measured(result: ObjectMap, reference: Reference, odometry: tuple[Array, Ar
         found |= accuracy(result.stamps, *odometry, truth, "odometry_")
     if reference.objects is not None:
         estimated = map_objects(result.quadrics, T_world_map)
-        found["object_accuracy"] = asdict(object_accuracy(estimated, reference.objects))
+        compared = asdict(object_accuracy(estimated, reference.objects))
+        # JSON knows no NaN.
+        found["object_accuracy"] = {name: None if np.isnan(value) else value for name, value in compared.items()}
     return found
 
 
@@ -62,15 +70,24 @@ def _write(
     result: ObjectMap,
     reference: Reference,
     odometry: tuple[Array, Array] | None,
-    found: dict[str, Any],
+    metrics: dict[str, Any],
 ) -> None:
     (folder / "trajectory.tum").write_text(tum_lines(result.stamps, result.poses), encoding="utf-8")
-    path = folder / "metrics.json"
-    before = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
-    path.write_text(json.dumps({**before, **found}, indent=1) + "\n", encoding="utf-8")
+    (folder / "metrics.json").write_text(json.dumps(metrics, indent=1) + "\n", encoding="utf-8")
     if odometry is not None:
         objects = [thing.ellipsoid for thing in reference.objects or ()]
         plot_run(folder / "trajectory.png", folder.name, result, odometry[0], reference.truth, objects)
+
+
+def _metrics(path: Path) -> dict[str, Any]:
+    """What a run knows of itself; nothing where it has written nothing."""
+    try:
+        content = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
+    except ValueError as error:
+        raise MetricsError(f"{path} is damaged: {error}; remove it, and it is written anew") from None
+    if not isinstance(content, dict):
+        raise MetricsError(f"{path} holds no metrics; remove it, and it is written anew")
+    return content
 
 
 def odometry_at(result: ObjectMap, motions: Sequence[RelativeMotion]) -> tuple[Array, Array] | None:
@@ -101,8 +118,9 @@ def table(metrics: dict[str, Any]) -> str:
     ]
     objects = metrics.get("object_accuracy")
     if objects:
+        lines.append(f"{'  of true ones':24}{found_objects(objects):>12}")
+    if objects and objects["matched"]:
         lines += [
-            f"{'  of true ones':24}{found_objects(objects):>12}",
             f"{'  centre error [m]':24}{objects['centre_m']:>12.3f}",
             f"{'  error of radii':24}{objects['radii']:>12.0%}",
             f"{'  3-D IoU':24}{objects['iou']:>12.2f}",
@@ -126,9 +144,7 @@ def _row(name: str, metrics: dict[str, Any], key: str, style: str) -> str:
 @command
 def main(argv: Sequence[str] | None = None) -> int:
     """Command line of `evaluate`; returns the exit code."""
-    parser = ArgumentParser(
-        prog="evaluate", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = ArgumentParser(prog="evaluate", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("run", type=Path, metavar="RUN", help="folder that slam_bag wrote, or a map file")
     parser.add_argument(
         "--reference",
@@ -141,7 +157,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     arguments = parser.parse_args(argv)
     try:
         metrics = evaluate(arguments.run, read_reference(arguments.reference))
-    except (MapFileError, NoGroundTruth, NoReference) as error:
+    except (MapFileError, MetricsError, NoGroundTruth, NoReference) as error:
         print(f"evaluate: {error}", file=sys.stderr)
         return 1
     print(json.dumps(metrics, indent=1) if arguments.json else table(metrics))

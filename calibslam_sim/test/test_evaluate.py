@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -118,6 +119,28 @@ def test_a_tum_folder_or_file_is_a_reference(run: Path, tmp_path: Path) -> None:
     assert "object_accuracy" not in of_file
     (folder / "odometry.txt").write_text("\n".join(lines))
     assert evaluate.evaluate(run, read_reference(folder))["odometry_ate_m"] < 1e-6
+
+
+def test_metrics_without_any_pair_are_json(run: Path, bag: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    whole = ObjectMap.load(run / "map.json")
+    strange = tuple(replace(quadric, class_id="unknown") for quadric in whole.quadrics)
+    replace(whole, quadrics=strange).save(run / "map.json")
+    assert evaluate.main([str(run), "--reference", str(bag)]) == 0
+    assert "0 of 19" in capsys.readouterr().out
+
+    def refuse(name: str) -> None:
+        raise AssertionError(f"{name} is no JSON")
+
+    objects = json.loads((run / "metrics.json").read_text(), parse_constant=refuse)["object_accuracy"]
+    assert (objects["matched"], objects["centre_m"], objects["radii"], objects["iou"]) == (0, None, None, None)
+
+
+@pytest.mark.parametrize("content", ["{", "[]", "\0"])
+def test_damaged_metrics_are_said(run: Path, bag: Path, content: str, capsys: pytest.CaptureFixture[str]) -> None:
+    (run / "metrics.json").write_text(content)
+    assert evaluate.main([str(run), "--reference", str(bag)]) == 1
+    assert "remove it, and it is written anew" in capsys.readouterr().err
+    assert (run / "metrics.json").read_text() == content and not (run / "trajectory.tum").exists()
 
 
 def test_what_cannot_be_compared_is_said(
