@@ -13,7 +13,9 @@ from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 
 import pytest
+import yaml
 
+from calibslam_sim import demo as demo_command
 from calibslam_sim import parameters
 
 PROJECT = Path(__file__).resolve().parents[1]
@@ -98,6 +100,14 @@ def test_links_lead_somewhere(page: Path) -> None:
             assert (page.parent / target).exists(), target
     for target in re.findall(r"`((?:docs|docker|test)/[\w/.*-]+)`", page.read_text()):
         assert list(PROJECT.glob(target)), target
+
+
+def test_what_the_demo_writes_in_a_container_stays() -> None:
+    demo = yaml.safe_load((PROJECT / "docker" / "compose.yaml").read_text())["services"]["demo"]
+    default = re.search(r'"--out", type=Path, default=Path\("(\w+)"\)', Path(str(demo_command.__file__)).read_text())
+    workdir = re.search(r"^WORKDIR (\S+)$", (PROJECT / "docker" / "Dockerfile").read_text(), re.MULTILINE)
+    assert default is not None and workdir is not None
+    assert demo["volumes"] == [f"../{default[1]}:{workdir[1]}/{default[1]}"]
 
 
 def test_every_reason_is_explained() -> None:
