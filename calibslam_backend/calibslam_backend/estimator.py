@@ -365,8 +365,8 @@ class Estimator:
     def _keyframe(
         self, boxes: Boxes, tracks: list[int], motion: Motion | None, found: Relocalised | None, began: float
     ) -> Keyframe:
-        for chore in self._chores:
-            chore()
+        while self._chores:  # one that fails is not tried again
+            self._chores.pop(0)()
         before = self._known
         objects = self._objects
         frame = objects.frame(boxes, tracks)

@@ -14,6 +14,7 @@ import numpy as np
 from calibslam_backend.estimator import Estimator, EstimatorSettings
 from calibslam_backend.geometry.transform import transform_from_text
 from calibslam_backend.keyframe import Keyframe
+from calibslam_backend.output.metrics import Trajectory
 from calibslam_backend.output.object_map import ObjectMap
 from calibslam_backend.output.published import POSE, TRANSFORM, camera_transform_message, map_messages, pose_message
 from calibslam_backend.output.run_folder import RunRecord, write_run
@@ -23,6 +24,8 @@ from calibslam_msgs_py.bags import BagError, BagReader, BagWriter, refuse_to_rep
 from calibslam_msgs_py.command import ArgumentParser, command
 from calibslam_msgs_py.measurements import SECOND, Boxes, InvalidMeasurement
 from calibslam_msgs_py.settings import SettingsError, add_arguments, from_arguments
+
+log = logging.getLogger(__name__)
 
 MAP_PERIOD = 5.0  # [s] of recorded time between two maps in run.mcap
 
@@ -109,6 +112,9 @@ def slam_bag(
             except InvalidMeasurement as error:
                 recording.reject(error)
                 continue
+            except Exception as error:
+                _failed(estimator, error)
+                continue
             for keyframe in new:
                 keyframes.append(keyframe)
                 writer.write(f"/{POSE}", pose_message(estimator, bags.types), keyframe.stamp)
@@ -119,9 +125,12 @@ def slam_bag(
                     for topic, message in map_messages(estimator, bags.types):
                         writer.write(f"/{topic}", message, keyframe.stamp)
             progress.show((last - first) / SECOND, len(keyframes), estimator.objects)
-        estimator.finish()
-        if batch:
-            estimator.optimise()
+        try:
+            estimator.finish()
+            if batch:
+                estimator.optimise()
+        except Exception as error:
+            _failed(estimator, error)
         if estimator.stamps:
             for topic, message in map_messages(estimator, bags.types):
                 writer.write(f"/{topic}", message, estimator.stamps[-1])
@@ -135,6 +144,13 @@ def slam_bag(
     record.calibrator = None if calibrator is None else str(Path(calibrator).resolve())
     truth, objects = recording.ground_truth(), recording.true_objects() or ()
     return write_run(out, Path(bag).name, estimator.object_map(), record, truth, objects)
+
+
+def _failed(estimator: Estimator, error: Exception) -> None:
+    """Count it, as a live session does, and say the first: the map as it was is gone on with."""
+    if not estimator.counts["errors"]:
+        log.warning("estimator (further errors are only counted): %s: %s", type(error).__name__, error)
+    estimator.counts["errors"] += 1
 
 
 def run_record(
@@ -152,7 +168,10 @@ def run_record(
     }
     return RunRecord(
         odometry=estimator.odometry(),
-        online=np.reshape([keyframe.T_map_camera for keyframe in keyframes], (-1, 4, 4)),
+        online=Trajectory(
+            np.array([keyframe.stamp for keyframe in keyframes]),
+            np.reshape([keyframe.T_map_camera for keyframe in keyframes], (-1, 4, 4)),
+        ),
         seconds=np.array([keyframe.seconds for keyframe in keyframes]),
         between=np.array([keyframe.between for keyframe in keyframes]),
         boxes_used=estimator.boxes_used,

@@ -16,6 +16,7 @@ from rosbags.rosbag2 import StoragePlugin, Writer
 from small_bag import WORLD, Message, messages, write
 
 from calibslam_backend import slam_bag
+from calibslam_backend.association.data_association import DataAssociation
 from calibslam_backend.output.object_map import ObjectMap
 from calibslam_backend.recording import Recording
 from calibslam_msgs_py import bags
@@ -440,3 +441,30 @@ def test_time_that_goes_backwards_in_a_bag(tmp_path: Path) -> None:
     assert metrics["rejected"]["overlap"] == 28
     assert metrics["rejected"]["late"] + metrics["rejected"].get("duplicate", 0) == 29
     assert metrics["keyframes"] > 20
+
+
+def test_an_estimator_that_fails_is_counted(
+    bag: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """As in a live session: what it failed in is left out, early or late in an image, and the run is written."""
+    vote, localise = DataAssociation.vote, DataAssociation.localise
+    failed: list[int] = []
+
+    def failing_vote(self: DataAssociation, k: int, motion: Any) -> None:
+        if k == 10:
+            raise np.linalg.LinAlgError("Eigenvalues did not converge")
+        vote(self, k, motion)
+
+    def failing_localise(self: DataAssociation, *arguments: Any) -> Any:
+        k = len(self._assignments.frames)
+        if k == 20 and not failed:
+            failed.append(k)
+            raise np.linalg.LinAlgError("Singular matrix")
+        return localise(self, *arguments)
+
+    monkeypatch.setattr(DataAssociation, "vote", failing_vote)
+    monkeypatch.setattr(DataAssociation, "localise", failing_localise)
+    metrics = run(bag, tmp_path / "run")
+    assert metrics["rejected"]["errors"] == 2
+    assert metrics["keyframes"] > 20 and metrics["ate_m"] < 0.05 and metrics["online_ate_m"] < 0.1
+    assert "LinAlgError: Eigenvalues did not converge" in caplog.text

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import resource
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -24,9 +24,9 @@ class RunRecord:
 
     Attributes:
         odometry: poses (N, 4, 4) of the keyframes by odometry alone, and covariances (N, 6, 6).
-        online: (N, 4, 4) each keyframe as known right after it.
-        seconds: (N,) each keyframe's update.
-        between: (N,) the longest that an image since the keyframe before took.
+        online: each keyframe as known right after it; without those in which the estimator failed.
+        seconds: each keyframe's update.
+        between: the longest that an image since the keyframe before took.
         boxes_used, boxes_rejected: numbers.
         box_correlation: of the errors of an object's boxes in consecutive keyframes.
         rejected: what was left out, by reason.
@@ -40,7 +40,7 @@ class RunRecord:
     """
 
     odometry: tuple[Array, Array]
-    online: Array
+    online: Trajectory
     seconds: Array
     between: Array
     boxes_used: int
@@ -62,16 +62,23 @@ def accuracy(
 ) -> dict[str, float | None]:
     """ATE, RPE and NEES of a trajectory as entries of metrics.json; None where there is no ground truth."""
     estimate = Trajectory(np.array(stamps), poses)
+    absolute = _error(ate, estimate, truth)
+    return {
+        f"{prefix}ate_m": absolute,
+        f"{prefix}rpe_m": None if absolute is None else _error(rpe, estimate, truth),
+        f"{prefix}nees_position": None
+        if absolute is None or truth is None
+        else position_nees(estimate, covariances, truth),
+    }
+
+
+def _error(
+    metric: Callable[[Trajectory, Trajectory], float], estimate: Trajectory, truth: Trajectory | None
+) -> float | None:
     try:
-        if truth is None:
-            raise NoGroundTruth("none given")
-        return {
-            f"{prefix}ate_m": ate(estimate, truth),
-            f"{prefix}rpe_m": rpe(estimate, truth),
-            f"{prefix}nees_position": position_nees(estimate, covariances, truth),
-        }
+        return None if truth is None else metric(estimate, truth)
     except NoGroundTruth:
-        return {f"{prefix}{name}": None for name in ("ate_m", "rpe_m", "nees_position")}
+        return None
 
 
 def milliseconds(seconds: Array) -> dict[str, float | None]:
@@ -85,11 +92,10 @@ def milliseconds(seconds: Array) -> dict[str, float | None]:
 def metrics_of(result: ObjectMap, record: RunRecord, truth: Trajectory | None) -> dict[str, Any]:
     """The content of metrics.json."""
     scores = association_scores(record.associations)
-    online = accuracy(result.stamps, record.online, result.covariances, truth, "online_")
     return {
         **accuracy(result.stamps, result.poses, result.covariances, truth),
         **accuracy(result.stamps, *record.odometry, truth, "odometry_"),
-        "online_ate_m": online["online_ate_m"],
+        "online_ate_m": _error(ate, record.online, truth),
         "keyframes": len(result.stamps),
         "objects": len(result.quadrics),
         "boxes_used": record.boxes_used,
