@@ -213,10 +213,15 @@ def _summary(out: Path, metrics: dict[str, object], replaces: bool) -> None:
     def metre(value: object) -> str:
         return f"{value:.3f} m" if isinstance(value, float) else "no ground truth"
 
+    all_keyframes, with_truth = metrics["keyframes"], metrics["keyframes_with_truth"]
+    of = "" if with_truth == all_keyframes else f" over {with_truth} of {all_keyframes} keyframes"
+    accuracy = f"ATE {metre(metrics['ate_m'])}{of} (odometry alone: {metre(metrics['odometry_ate_m'])})"
+    if metrics["ate_m"] is None:
+        accuracy = f"no ATE: {metrics['no_accuracy']}"
     print(
         f"{metrics['keyframes']} keyframes, {metrics['objects']} objects, "
         f"{metrics['boxes_used']} boxes used, {metrics['boxes_rejected']} rejected\n"
-        f"ATE {metre(metrics['ate_m'])} (odometry alone: {metre(metrics['odometry_ate_m'])})\n"
+        f"{accuracy}\n"
         f"result: {out}{' (instead of the run that was there)' if replaces else ''}, picture: {out / 'trajectory.png'}"
     )
 

@@ -13,6 +13,7 @@ from calibslam_backend.output.metrics import (
     association_scores,
     ate,
     interpolated,
+    keyframes_with_truth,
     position_nees,
     rpe,
 )
@@ -93,6 +94,28 @@ def test_keyframes_are_matched_within_20_ms() -> None:
         ate(Trajectory(truth.stamps[:0], truth.poses[:0]), truth)
     with pytest.raises(NoGroundTruth, match="only 2 keyframes"):
         rpe(Trajectory(truth.stamps[:2], truth.poses[:2]), truth)
+
+
+def test_rpe_does_not_reach_across_a_gap_of_the_truth() -> None:
+    """Steps of 1 m measured as 1.1 m, but for three without truth, measured as 2 m."""
+    truth = at(*[(x, 0, 0) for x in range(10)], step=SECOND)
+    estimate = Trajectory(truth.stamps, truth.poses.copy())
+    estimate.poses[:, 0, 3] = np.cumsum([0, 1.1, 1.1, 1.1, 2, 2, 2, 1.1, 1.1, 1.1])
+    known = [0, 1, 2, 3, 6, 7, 8, 9]
+    with_gap = Trajectory(truth.stamps[known], truth.poses[known])
+    assert keyframes_with_truth(estimate, with_gap) == 8
+    assert rpe(estimate, with_gap) == pytest.approx(0.1)
+    with pytest.raises(NoGroundTruth, match="no two consecutive"):
+        rpe(estimate, Trajectory(truth.stamps[::2], truth.poses[::2]))
+
+
+def test_keyframes_with_truth_are_counted_once() -> None:
+    """Ground truth of 100 Hz that covers two of five keyframes, and two poses of it that cover one."""
+    estimate = at(*[(x, 0, 0) for x in range(5)], step=SECOND)
+    dense = at(*[(0.01 * x, 0, 0) for x in range(110)], step=SECOND // 100)
+    assert keyframes_with_truth(estimate, dense) == 2
+    assert keyframes_with_truth(estimate, Trajectory(dense.stamps[:2], dense.poses[:2])) == 1
+    assert keyframes_with_truth(estimate, Trajectory(dense.stamps + 90 * SECOND, dense.poses)) == 0
 
 
 def test_truth_between_its_poses() -> None:

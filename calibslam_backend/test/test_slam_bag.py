@@ -214,7 +214,24 @@ def test_without_ground_truth_there_is_no_error_to_state(tmp_path: Path, capsys:
     write(tmp_path / "bag", [m for m in messages() if m[0] != "/ground_truth"])
     metrics = run(tmp_path / "bag", tmp_path / "run")
     assert metrics["ate_m"] is None and metrics["nees_position"] is None
-    assert "ATE no ground truth" in capsys.readouterr().out
+    assert metrics["keyframes_with_truth"] == 0
+    assert "no ATE: no ground truth\n" in capsys.readouterr().out
+
+
+def test_how_much_ground_truth_there_is_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    content = list(messages())
+    write(tmp_path / "bag", [m for m in content if m[0] != "/ground_truth" or m[1] < WORLD.stamps[40]])
+    metrics = run(tmp_path / "bag", tmp_path / "run")
+    some, all_keyframes = metrics["keyframes_with_truth"], metrics["keyframes"]
+    assert 3 < some < all_keyframes / 2
+    said = capsys.readouterr().out
+    assert f"ATE {metrics['ate_m']:.3f} m over {some} of {all_keyframes} keyframes (odometry alone: " in said
+    for topic, _, message in content:
+        if topic == "/ground_truth":
+            message.header.stamp.sec += 5000
+    write(tmp_path / "later", content)
+    assert run(tmp_path / "later", tmp_path / "run")["ate_m"] is None
+    assert "no ATE: no ground truth within 0.02 s of any keyframe" in capsys.readouterr().out
 
 
 # -- bags that cannot be used ---------------------------------------------------------------------------------------

@@ -22,7 +22,7 @@ from calibslam_backend.odometry.motion_noise import MotionNoise
 from calibslam_backend.output.metrics import NoGroundTruth, Trajectory, alignment
 from calibslam_backend.output.object_map import MapFileError, ObjectMap, tum_lines
 from calibslam_backend.output.plots import plot_run
-from calibslam_backend.output.run_folder import accuracy
+from calibslam_backend.output.run_folder import accuracy, coverage
 from calibslam_msgs_py.command import ArgumentParser, command
 from calibslam_msgs_py.measurements import Array, RelativeMotion
 from calibslam_sim.accuracy.objects import map_objects, object_accuracy
@@ -43,6 +43,7 @@ def evaluate(run: Path, reference: Reference) -> dict[str, Any]:
     """
     result = ObjectMap.load(run if run.is_file() else run / "map.json")
     before = {} if run.is_file() else _metrics(run / "metrics.json")
+    before.pop("no_accuracy", None)  # there is one now
     odometry = odometry_at(result, reference.motions)
     found = _measured(result, reference, odometry)
     if not run.is_file():
@@ -55,6 +56,7 @@ def _measured(result: ObjectMap, reference: Reference, odometry: tuple[Array, Ar
     T_world_map = alignment(Trajectory(np.array(result.stamps), result.poses), truth)
     found: dict[str, Any] = accuracy(result.stamps, result.poses, result.covariances, truth)
     found |= {"keyframes": len(result.stamps), "objects": len(result.quadrics)}
+    found |= coverage(result.stamps, result.poses, truth)
     if odometry is not None:
         found |= accuracy(result.stamps, *odometry, truth, "odometry_")
     if reference.objects is not None:
@@ -108,7 +110,9 @@ def odometry_at(result: ObjectMap, motions: Sequence[RelativeMotion]) -> tuple[A
 
 def table(metrics: dict[str, Any]) -> str:
     """The metrics for a person."""
+    some, keyframes = metrics["keyframes_with_truth"], metrics["keyframes"]
     lines = [
+        *([f"ATE over {some} of {keyframes} keyframes: the others have no ground truth"] if some < keyframes else []),
         f"{'':24}{'estimate':>12}{'odometry alone':>16}",
         _row("ATE [m]", metrics, "ate_m", "{:.3f}"),
         _row("RPE [m]", metrics, "rpe_m", "{:.4f}"),

@@ -11,11 +11,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from calibslam_backend.output.metrics import Trajectory
 from calibslam_backend.output.object_map import ObjectMap
 from calibslam_msgs_py.bags import BagWriter
 from calibslam_msgs_py.measurements import QuadricEstimate
 from calibslam_sim import evaluate, topics
-from calibslam_sim.accuracy.reference import NoReference, read_reference
+from calibslam_sim.accuracy.reference import NoReference, Reference, read_reference
 from calibslam_sim.simulate import write_bag
 from calibslam_sim.simulation.recording import SimulationSettings, simulate
 
@@ -75,6 +76,7 @@ def test_known_errors_are_measured(run: Path, bag: Path, capsys: pytest.CaptureF
     written = json.loads((run / "metrics.json").read_text())
     assert written["wall_s"] == 7.0
     assert written["ate_m"] == metrics["ate_m"]
+    assert metrics["keyframes_with_truth"] == n
     assert len((run / "trajectory.tum").read_text().splitlines()) == n
     assert (run / "trajectory.png").stat().st_size > 10_000
 
@@ -103,6 +105,15 @@ def test_a_map_file_is_evaluated_and_nothing_beside_it_changed(
 def test_objects_that_are_none_are_told() -> None:
     for estimated, told in ((4, "4 of 19"), (5, "4 of 19, 1 that is none"), (6, "4 of 19, 2 that are none")):
         assert evaluate.found_objects({"true": 19, "matched": 4, "estimated": estimated}) == told
+
+
+def test_how_much_ground_truth_there_is_is_said(run: Path) -> None:
+    (run / "metrics.json").write_text('{"no_accuracy": "no ground truth"}')
+    truth = Trajectory(SIMULATION.times[: 5 * EVERY], SIMULATION.T_world_camera[: 5 * EVERY])
+    metrics = evaluate.evaluate(run, Reference(truth, [], None))
+    assert metrics["keyframes_with_truth"] == 5
+    assert f"ATE over 5 of {metrics['keyframes']} keyframes" in evaluate.table(metrics)
+    assert "no_accuracy" not in json.loads((run / "metrics.json").read_text())
 
 
 def test_a_tum_folder_or_file_is_a_reference(run: Path, tmp_path: Path) -> None:
@@ -150,6 +161,10 @@ def test_what_cannot_be_compared_is_said(
         writer.add_topic(topics.ODOMETRY, "nav_msgs/msg/Odometry")
     with pytest.raises(NoReference, match="has no /ground_truth"):
         read_reference(tmp_path / "empty")
+    (tmp_path / "tum").mkdir()
+    (tmp_path / "tum" / "odometry.txt").touch()
+    with pytest.raises(NoReference, match=r"tum has no groundtruth\.txt"):
+        read_reference(tmp_path / "tum")
     with pytest.raises(NoReference, match=r"does not exist|cannot be read"):
         read_reference(tmp_path / "nowhere")
     (run / "map.json").unlink()

@@ -39,13 +39,28 @@ class NoGroundTruth(ValueError):
     """Estimate and ground truth have too few times in common, or do not determine an alignment."""
 
 
-def _matched(estimate: Trajectory, truth: Trajectory) -> tuple[PoseTrajectory3D, PoseTrajectory3D]:
+def _near(estimate: Trajectory, truth: Trajectory) -> tuple[PoseTrajectory3D, PoseTrajectory3D]:
     if not len(estimate.stamps):
         raise NoGroundTruth("there is no keyframe")
     try:
         reference, matched = sync.associate_trajectories(truth.evo(), estimate.evo(), max_diff=MAX_STAMP_DIFFERENCE)
     except sync.SyncException as error:
-        raise NoGroundTruth(f"no ground truth within {MAX_STAMP_DIFFERENCE} s of any keyframe") from error
+        raise NoGroundTruth(
+            f"no ground truth within {MAX_STAMP_DIFFERENCE} s of any keyframe: is it of this time, and of one clock?"
+        ) from error
+    return reference, matched
+
+
+def keyframes_with_truth(estimate: Trajectory, truth: Trajectory) -> int:
+    """How many poses of the estimate have ground truth."""
+    try:
+        return len(np.unique(_near(estimate, truth)[1].timestamps))
+    except NoGroundTruth:
+        return 0
+
+
+def _matched(estimate: Trajectory, truth: Trajectory) -> tuple[PoseTrajectory3D, PoseTrajectory3D]:
+    reference, matched = _near(estimate, truth)
     if matched.num_poses < 3:
         raise NoGroundTruth(f"only {matched.num_poses} keyframes have ground truth; an alignment needs 3")
     return reference, matched
@@ -75,14 +90,20 @@ def ate(estimate: Trajectory, truth: Trajectory) -> float:
 
 
 def rpe(estimate: Trajectory, truth: Trajectory) -> float:
-    """Relative pose error [m], rms of the translation part between consecutive keyframes.
+    """Relative pose error [m], rms of the translation part between consecutive keyframes that both have ground truth.
 
     Raises:
-        NoGroundTruth: fewer than three keyframes have ground truth.
+        NoGroundTruth: fewer than three keyframes have ground truth, or no two consecutive ones.
     """
+    reference, matched = _matched(estimate, truth)
     metric = metrics.RPE(metrics.PoseRelation.translation_part, 1.0, metrics.Unit.frames)
-    metric.process_data(_matched(estimate, truth))
-    return float(metric.get_statistic(metrics.StatisticsType.rmse))
+    metric.process_data((reference, matched))
+    # Those on both sides of a gap of the ground truth are no consecutive keyframes.
+    indices = np.searchsorted(estimate.evo().timestamps, matched.timestamps)
+    errors = np.asarray(metric.error)[np.diff(indices) == 1]
+    if not len(errors):
+        raise NoGroundTruth("no two consecutive keyframes have ground truth")
+    return float(np.sqrt(np.mean(errors**2)))
 
 
 def alignment(estimate: Trajectory, truth: Trajectory) -> Array:

@@ -12,7 +12,15 @@ from typing import Any
 import numpy as np
 
 from calibslam_backend.geometry.ellipsoid import Ellipsoid
-from calibslam_backend.output.metrics import NoGroundTruth, Trajectory, association_scores, ate, position_nees, rpe
+from calibslam_backend.output.metrics import (
+    NoGroundTruth,
+    Trajectory,
+    association_scores,
+    ate,
+    keyframes_with_truth,
+    position_nees,
+    rpe,
+)
 from calibslam_backend.output.object_map import ObjectMap, tum_lines
 from calibslam_backend.output.plots import plot_run
 from calibslam_msgs_py.measurements import Array
@@ -81,6 +89,19 @@ def _error(
         return None
 
 
+def coverage(stamps: Sequence[int], poses: Array, truth: Trajectory | None) -> dict[str, int | str]:
+    """How many keyframes the accuracy is of, as an entry of metrics.json; and if there is none, why."""
+    if truth is None:
+        return {"keyframes_with_truth": 0, "no_accuracy": "no ground truth"}
+    estimate = Trajectory(np.array(stamps), poses)
+    found: dict[str, int | str] = {"keyframes_with_truth": keyframes_with_truth(estimate, truth)}
+    try:
+        ate(estimate, truth)
+    except NoGroundTruth as error:
+        found["no_accuracy"] = str(error)
+    return found
+
+
 def milliseconds(seconds: Array) -> dict[str, float | None]:
     """Median, 99th percentile and maximum [ms]; None of nothing."""
     if not len(seconds):
@@ -97,6 +118,7 @@ def metrics_of(result: ObjectMap, record: RunRecord, truth: Trajectory | None) -
         **accuracy(result.stamps, *record.odometry, truth, "odometry_"),
         "online_ate_m": _error(ate, record.online, truth),
         "keyframes": len(result.stamps),
+        **coverage(result.stamps, result.poses, truth),
         "objects": len(result.quadrics),
         "boxes_used": record.boxes_used,
         "boxes_rejected": record.boxes_rejected,

@@ -14,6 +14,9 @@ from calibslam_sim import topics
 from calibslam_sim.accuracy.objects import MapObject, map_objects
 from calibslam_sim.tum_folder import TumError, read_trajectory
 
+# By which a folder in TUM format is told from a bag.
+TUM_FILES = {"camera_info.yaml", "odometry.txt", "detections.csv", "rgb.txt"}
+
 
 class NoReference(ValueError):
     """A reference that cannot be used; the text says why."""
@@ -40,6 +43,9 @@ def read_reference(path: Path) -> Reference:
     Raises:
         NoReference: there is no true trajectory, or the bag or file cannot be read.
     """
+    there = {file.name for file in path.iterdir()} if path.is_dir() else set()
+    if there & TUM_FILES and not there & {"groundtruth.txt", "metadata.yaml"}:
+        raise NoReference(f"{path} has no groundtruth.txt: nothing to compare with")
     try:
         if path.suffix == ".mcap" or (path.is_dir() and not (path / "groundtruth.txt").exists()):
             return _from_bag(path)
