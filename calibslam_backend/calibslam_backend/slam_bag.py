@@ -27,6 +27,7 @@ from calibslam_msgs_py.settings import SettingsError, add_arguments, from_argume
 
 log = logging.getLogger(__name__)
 
+OF_BOXES = ("double_box", "misfit", "no_identity")  # reasons of single boxes, beside `box_...`
 MAP_PERIOD = 5.0  # [s] of recorded time between two maps in run.mcap
 
 
@@ -175,7 +176,7 @@ def run_record(
         seconds=np.array([keyframe.seconds for keyframe in keyframes]),
         between=np.array([keyframe.between for keyframe in keyframes]),
         boxes_used=estimator.boxes_used,
-        boxes_rejected=sum(rejections.values()),
+        boxes_rejected=sum(n for reason, n in rejections.items() if reason.startswith("box_") or reason in OF_BOXES),
         box_correlation=estimator.box_correlation,
         rejected=rejections,
         counts={k: n for k, n in counts.items() if not k.startswith("rejected_")},
