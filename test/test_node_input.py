@@ -26,7 +26,7 @@ from std_srvs.srv import SetBool, Trigger
 from calibslam_backend.backend_node import BackendNode
 from calibslam_backend.output.metrics import ate
 from calibslam_backend.ros.event_messages_node import Decoder
-from calibslam_backend.session.intake import Event, Kind
+from calibslam_backend.session.intake import Event, Kind, Report
 from calibslam_backend.session.journal import Journal, Record
 from calibslam_msgs_py.conversions import RosTypes, boxes_to_msg, camera_to_msg, motion_to_msg
 from calibslam_msgs_py.measurements import SECOND, Boxes, Camera, RelativeMotion
@@ -221,6 +221,25 @@ def test_another_camera(robot: Robot) -> None:
     robot.camera(5 * SECOND, other)
     robot.camera(6 * SECOND)
     robot.expect(rejected_camera_changed=4)
+
+
+class Said(Report):
+    """What a decoder reports."""
+
+    def __init__(self) -> None:
+        self.texts: list[str] = []
+
+    def say(self, text: str) -> None:
+        self.texts.append(text)
+
+
+def test_boxes_of_another_image_size_are_warned_of_once() -> None:
+    said = Said()
+    decoder = Decoder("map", said)
+    for measured in list(WORLD.boxes())[:60]:
+        drawn = boxes_to_msg(replace(measured, corners=1.5 * measured.corners), TYPES)
+        decoder.event(Kind.BOXES, serialize_message(drawn), 0.0)
+    assert len(said.texts) == 1 and "do boxes and camera_info belong to one image size?" in said.texts[0]
 
 
 @pytest.fixture

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any
@@ -17,6 +17,7 @@ from calibslam_backend.odometry.motion_chain import OdometryDifferencer
 from calibslam_backend.output.metrics import Trajectory
 from calibslam_msgs_py.bags import BagError, BagReader
 from calibslam_msgs_py.conversions import (
+    BeyondImage,
     boxes_from_msg,
     camera_from_msg,
     motion_from_msg,
@@ -70,6 +71,8 @@ class Recording:
         path: of the bag.
         camera: from its camera_info.
         rejected: why and how many messages or boxes were left out.
+        valid: how many boxes were not.
+        beyond: of boxes that go beyond the image.
         topics: where boxes, odometry and camera come from, by the names of `NAMEABLE`.
     """
 
@@ -78,6 +81,8 @@ class Recording:
     rejected: Counter[str]
     topics: dict[str, str]
     _calibrator: Calibrator | None
+    valid: int = 0
+    beyond: BeyondImage = field(default_factory=BeyondImage)
 
     @classmethod
     def open(cls, path: str | Path, calibrator: str | None = None, named: Mapping[str, str] | None = None) -> Recording:
@@ -160,7 +165,9 @@ class Recording:
             found, left_out = boxes_from_detections_2d(message, self.camera)
         else:
             found, left_out = boxes_from_msg(message), {}
+        self.beyond.see(found)
         boxes, dropped = valid_boxes(found)
+        self.valid += len(boxes)
         self.rejected.update({f"box_{reason}": n for reason, n in {**left_out, **dropped}.items()})
         return boxes
 

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
+from calibslam_backend.doubts import Course, doubts
 from calibslam_backend.estimator import Estimator, EstimatorSettings
 from calibslam_backend.geometry.transform import transform_from_text
 from calibslam_backend.keyframe import Keyframe
@@ -22,7 +23,7 @@ from calibslam_backend.recording import BOXES, CAMERA, MOTIONS, NAMEABLE, ODOMET
 from calibslam_msgs_py import bags
 from calibslam_msgs_py.bags import BagError, BagReader, BagWriter, refuse_to_replace
 from calibslam_msgs_py.command import ArgumentParser, command
-from calibslam_msgs_py.measurements import SECOND, Boxes, InvalidMeasurement
+from calibslam_msgs_py.measurements import SECOND, Boxes, InvalidMeasurement, RelativeMotion
 from calibslam_msgs_py.settings import SettingsError, add_arguments, from_arguments
 
 log = logging.getLogger(__name__)
@@ -68,6 +69,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except (BagError, SettingsError, ValueError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 1
+    warnings = metrics["warnings"]
+    if not metrics["keyframes"] and isinstance(warnings, list) and warnings:
+        print(f"error: {parsed.bag}: {warnings[0]}", file=sys.stderr)
+        return 1
     if not metrics["keyframes"]:
         counts = metrics["counts"]
         why = (
@@ -101,6 +106,7 @@ def slam_bag(
     out.mkdir(parents=True, exist_ok=True)
     began = time.perf_counter()
     keyframes: list[Keyframe] = []
+    motions: list[int] = []
     first, last = 0, 0
     progress = _Progress(Path(bag))
     with BagWriter(out / "run.mcap", overwrite=True) as writer:
@@ -116,6 +122,8 @@ def slam_bag(
             except Exception as error:
                 _failed(estimator, error)
                 continue
+            if isinstance(measurement, RelativeMotion):
+                motions.append(stamp)
             for keyframe in new:
                 keyframes.append(keyframe)
                 writer.write(f"/{POSE}", pose_message(estimator, bags.types), keyframe.stamp)
@@ -140,6 +148,18 @@ def slam_bag(
     record = run_record(
         estimator, keyframes, dict(+recording.rejected), time.perf_counter() - began, (last - first) / SECOND
     )
+    course = Course(
+        keyframes=len(estimator.stamps),
+        objects=estimator.objects,
+        boxes=len(record.associations),
+        used=record.boxes_used,
+        valid=recording.valid,
+        rejected=recording.rejected,
+        counts=estimator.counts,
+        beyond=recording.beyond.problem,
+        motions=motions,
+    )
+    record.warnings = doubts(course)
     record.recording = str(Path(bag).resolve())
     record.topics = recording.topics
     record.calibrator = None if calibrator is None else str(Path(calibrator).resolve())
@@ -225,6 +245,9 @@ def _summary(out: Path, metrics: dict[str, object], replaces: bool) -> None:
         f"{accuracy}\n"
         f"result: {out}{' (instead of the run that was there)' if replaces else ''}, picture: {out / 'trajectory.png'}"
     )
+    warnings = metrics["warnings"]
+    for warning in warnings if isinstance(warnings, list) else []:
+        print(f"warning: {warning}")
 
 
 if __name__ == "__main__":

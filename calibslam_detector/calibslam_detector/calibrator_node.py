@@ -15,7 +15,7 @@ from calibslam_msgs.msg import BoundingBoxArray
 from rclpy.node import Node
 
 from calibslam_detector.foreign_boxes.calibrator import CalibratorError, load
-from calibslam_msgs_py.conversions import RosTypes, boxes_from_msg, boxes_to_msg, valid_boxes
+from calibslam_msgs_py.conversions import BeyondImage, RosTypes, boxes_from_msg, boxes_to_msg, valid_boxes
 from calibslam_msgs_py.measurements import InvalidMeasurement
 from calibslam_msgs_py.node import MEASUREMENT, MEASUREMENT_INPUT, Counters, advertise, run, subscribe
 from calibslam_msgs_py.settings import Settings, SettingsError, declare_parameters, setting
@@ -40,16 +40,20 @@ class CalibratorNode(Node):
             raise SettingsError(str(error)) from error
         self._types = RosTypes()
         self._counters = Counters(self)
+        self._beyond = BeyondImage()
         self._publisher = advertise(self, BoundingBoxArray, "detections", MEASUREMENT)
         subscribe(self, self._counters, BoundingBoxArray, "detections_raw", self._receive, MEASUREMENT_INPUT)
 
     def _receive(self, message: Any) -> None:
         try:
-            boxes, rejected = valid_boxes(boxes_from_msg(message))
+            drawn = boxes_from_msg(message)
+            boxes, rejected = valid_boxes(drawn)
         except InvalidMeasurement as error:
             self._counters.reject(error)
             return
         self._counters.arrived("detections_raw", boxes.stamp)
+        if problem := self._beyond.news(drawn):  # the back end gets them cut
+            self._counters.warn(problem)
         for reason, count in rejected.items():
             self._counters.reject(InvalidMeasurement(reason, f"{count} boxes: {reason}"), count)
         self._publisher.publish(boxes_to_msg(self._calibrate(boxes), self._types))

@@ -14,7 +14,7 @@ from rclpy.node import Node
 from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import CameraInfo
 
-from calibslam_msgs_py.conversions import RosTypes, boxes_to_msg, camera_from_msg, valid_boxes
+from calibslam_msgs_py.conversions import BeyondImage, RosTypes, boxes_to_msg, camera_from_msg, valid_boxes
 from calibslam_msgs_py.detection_conversions import DETECTIONS_2D, boxes_from_detections_2d
 from calibslam_msgs_py.measurements import Camera, InvalidMeasurement
 from calibslam_msgs_py.node import MEASUREMENT, SENSOR, Counters, advertise, run, subscribe
@@ -38,6 +38,7 @@ class Detection2DNode(Node):
             ) from None
         self._camera: Camera | None = None
         self._counters = Counters(self)
+        self._beyond = BeyondImage()
         self._publisher = advertise(self, BoundingBoxArray, "detections_raw", MEASUREMENT)
         subscribe(self, self._counters, CameraInfo, "camera/camera_info", self._receive_camera, SENSOR)
         subscribe(self, self._counters, kind, "detections_2d", self._receive, FOREIGN_INPUT)
@@ -58,6 +59,8 @@ class Detection2DNode(Node):
         except InvalidMeasurement as error:
             self._counters.reject(error)
             return
+        if problem := self._beyond.news(found):
+            self._counters.warn(problem)
         boxes, rejected = valid_boxes(found)
         for reason, count in {**left_out, **rejected}.items():
             self._counters.reject(InvalidMeasurement(f"box_{reason}", f"{count} boxes: {reason}"), count)

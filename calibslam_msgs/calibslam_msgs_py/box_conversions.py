@@ -18,6 +18,9 @@ from calibslam_msgs_py.geometry_conversions import (
 from calibslam_msgs_py.measurements import Array, Boxes, InvalidMeasurement
 from calibslam_msgs_py.message_types import MessageTypes
 
+# Of the image's size, that a box of a good detector goes beyond it, and of boxes that go farther.
+FAR_BEYOND, MANY_BEYOND = 0.05, 0.05
+ENOUGH_BOXES = 100  # to tell whether they are many
 LARGEST_COORDINATE = 1e6  # [px] of a corner, many times any image: what is larger is garbage
 
 
@@ -84,6 +87,38 @@ def valid_boxes(boxes: Boxes) -> tuple[Boxes, dict[str, int]]:
     # Some detectors draw what they believe to be beyond the image.
     inside = np.clip(boxes.corners, 0.0, [boxes.width, boxes.height] * 2)
     return (boxes if (inside == boxes.corners).all() else replace(boxes, corners=inside)), rejected
+
+
+class BeyondImage:
+    """Counts boxes that go far beyond the image, as those drawn in images of another size do."""
+
+    def __init__(self) -> None:
+        self._boxes = self._beyond = 0
+        self._told = False
+
+    def see(self, boxes: Boxes) -> None:
+        """The boxes of an image, before they are cut."""
+        size = np.array([boxes.width, boxes.height])
+        far = (boxes.corners[:, :2] < -FAR_BEYOND * size) | (boxes.corners[:, 2:] > (1.0 + FAR_BEYOND) * size)
+        self._boxes += len(boxes)
+        self._beyond += int(far.any(axis=1).sum())
+
+    @property
+    def problem(self) -> str:
+        """What to say if there are many; "" otherwise."""
+        if self._boxes < ENOUGH_BOXES or self._beyond <= MANY_BEYOND * self._boxes:
+            return ""
+        return (
+            f"{self._beyond} of {self._boxes} boxes go beyond the image by more than {FAR_BEYOND:.0%} of it: do boxes "
+            "and camera_info belong to one image size?"
+        )
+
+    def news(self, boxes: Boxes) -> str:
+        """`see`, and `problem` the first time there is one."""
+        self.see(boxes)
+        problem = "" if self._told else self.problem
+        self._told = self._told or bool(problem)
+        return problem
 
 
 def boxes_to_msg(boxes: Boxes, types: MessageTypes) -> Any:

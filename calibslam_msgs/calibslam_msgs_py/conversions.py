@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from calibslam_msgs_py.box_conversions import boxes_from_msg, boxes_to_msg, valid_boxes
+from calibslam_msgs_py.box_conversions import BeyondImage, boxes_from_msg, boxes_to_msg, valid_boxes
 from calibslam_msgs_py.covariance import (
     gtsam_from_ros_covariance,
     ros_from_gtsam_covariance,
@@ -49,6 +49,7 @@ from calibslam_msgs_py.measurements import (
 from calibslam_msgs_py.message_types import MessageTypes, RosTypes
 
 __all__ = [
+    "BeyondImage",
     "MessageTypes",
     "RosTypes",
     "boxes_from_msg",

@@ -133,6 +133,24 @@ def test_a_box_partly_outside_is_cut_at_the_border(drawn: list[float], cut: list
     np.testing.assert_array_equal(kept.corners, [cut])
 
 
+@pytest.mark.parametrize(
+    ("corners", "many"),
+    [
+        ([10.0, 10.0, 671.0, 300.0], False),  # as far as good detectors draw
+        ([10.0, 10.0, 673.0, 300.0], True),
+        ([10.0, -25.0, 30.0, 30.0], True),
+        ([700.0, 10.0, 800.0, 300.0], True),
+        ([np.nan, 10.0, 30.0, 30.0], False),
+    ],
+)
+def test_many_boxes_far_beyond_the_image_are_told_once(corners: list[float], many: bool) -> None:
+    beyond = c.BeyondImage()
+    told = [beyond.news(with_box(corners if k % 10 == 0 else [10.0, 10.0, 30.0, 30.0])) for k in range(200)]
+    assert bool(beyond.problem) == many
+    assert [k for k, news in enumerate(told) if news] == ([99] if many else [])
+    assert not many or told[99].startswith("10 of 100 boxes go beyond the image by more than 5% of it")
+
+
 def test_nan_covariance_in_a_message_is_a_defect_and_not_unknown(types: c.MessageTypes) -> None:
     msg = c.boxes_to_msg(boxes(), types)
     msg.boxes[0].covariance = np.full(16, np.nan)

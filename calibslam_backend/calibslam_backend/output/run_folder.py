@@ -41,6 +41,7 @@ class RunRecord:
         counts: of all else that happened, such as images, motions, and quadrics that were merged.
         associations: quadric and true identity of each box of a keyframe.
         wall_s, sequence_s: duration of the run and of the recording.
+        warnings: what a person should look at.
         recording: absolute path of the bag.
         topics: its topics that were used, as `Recording` has them.
         calibrator: file that gave boxes their covariances; None: the default, or the boxes had them.
@@ -59,6 +60,7 @@ class RunRecord:
     associations: Sequence[tuple[int | None, str]]
     wall_s: float
     sequence_s: float
+    warnings: list[str] = field(default_factory=list)
     recording: str = ""
     topics: dict[str, str] = field(default_factory=dict)
     calibrator: str | None = None
@@ -125,6 +127,7 @@ def metrics_of(result: ObjectMap, record: RunRecord, truth: Trajectory | None) -
         "box_correlation": record.box_correlation,
         "rejected": record.rejected,
         "counts": record.counts,
+        "warnings": record.warnings,
         "update_ms": milliseconds(record.seconds),
         "between_ms": milliseconds(record.between),
         "wall_s": record.wall_s,

@@ -13,6 +13,7 @@ from calibslam_backend.output.object_map import ObjectMap
 from calibslam_backend.session.intake import Content, Event, Kind, Report
 from calibslam_backend.session.journal import Record
 from calibslam_msgs_py.conversions import (
+    BeyondImage,
     boxes_from_msg,
     camera_from_msg,
     motion_from_msg,
@@ -41,6 +42,7 @@ class Decoder:
 
     def __init__(self, map_frame: str, report: Report) -> None:
         self._map_frame, self._report = map_frame, report
+        self._beyond = BeyondImage()
 
     def event(self, kind: Kind, data: bytes, arrived: float) -> Event:
         """The event of a message (CDR) that came at a time (monotonic [s]).
@@ -79,7 +81,10 @@ class Decoder:
                     "frame", f"a start pose in frame '{message.header.frame_id}' instead of '{self._map_frame}'"
                 )
             return StampedPose(stamp_from_msg(message.header.stamp), pose_from_msg(message.pose.pose))
-        boxes, dropped = valid_boxes(boxes_from_msg(message))
+        drawn = boxes_from_msg(message)
+        if problem := self._beyond.news(drawn):
+            self._report.say(problem)
+        boxes, dropped = valid_boxes(drawn)
         for reason, count in dropped.items():
             self._report.reject(InvalidMeasurement(f"box_{reason}", f"{count} boxes: {reason}"), count)
         return boxes
