@@ -19,6 +19,9 @@ from calibslam_msgs_py.measurements import Boxes, Camera, StampedPose
 FRAME_ID = "camera"
 DETECTION_COLUMNS = ("timestamp", "xmin", "ymin", "xmax", "ymax", "score", "class_id")
 
+SEPARATORS = ",;\t"
+ZERO_IS_PINHOLE = ("plumb_bob", "rational_polynomial")  # distortion models
+
 # Published intrinsics of the benchmark's colour cameras: fx fy cx cy, k1 k2 p1 p2 k3.
 # https://cvg.cit.tum.de/data/datasets/rgbd-dataset/file_formats
 PRESETS: dict[str, tuple[tuple[float, ...], tuple[float, ...]]] = {
@@ -50,7 +53,10 @@ def read_camera(path: Path) -> Camera:
     try:
         content = yaml.safe_load(_text(path))
         model = content.get("distortion_model", "plumb_bob")
-        coefficients = np.array(content["distortion_coefficients"]["data"], float)
+        is_pinhole = not content.keys() & {"distortion_model", "distortion_coefficients"}
+        coefficients = np.zeros(5) if is_pinhole else np.array(content["distortion_coefficients"]["data"], float)
+        if model in ZERO_IS_PINHOLE and not coefficients.any():
+            model, coefficients = "plumb_bob", np.zeros(5)
         camera = Camera(
             int(content["image_width"]),
             int(content["image_height"]),
@@ -83,8 +89,10 @@ def read_trajectory(path: Path) -> list[StampedPose]:
         numbers = np.array([_number(word, path, line) for word in words[1:]])
         norm = float(np.linalg.norm(numbers[3:]))
         if abs(norm - 1.0) > QUATERNION_TOLERANCE:
-            raise TumError(f"{path}:{line}: quaternion of length {norm:.4g} instead of 1")
-        if poses and stamp <= poses[-1].stamp:
+            raise _line_error(path, line, f"quaternion of length {norm:.4g} instead of 1")
+        if poses and stamp == poses[-1].stamp:
+            raise TumError(f"{path}:{line}: a second pose of the time {words[0]}; keep one of them")
+        if poses and stamp < poses[-1].stamp:
             raise TumError(f"{path}:{line}: time does not increase; sort the file by its first column")
         T = np.eye(4)
         T[:3, :3] = rotation_from_quaternion(numbers[3:] / norm)
@@ -109,23 +117,28 @@ def read_image_list(path: Path) -> list[tuple[int, Path]]:
 def read_detections(path: Path, camera: Camera) -> list[Boxes]:
     """Boxes of each image, without covariances, in order of time.
 
-    The first line names the columns: `DETECTION_COLUMNS`, and `object_id` where identities are known.
+    The first line names the columns: `DETECTION_COLUMNS`, and `object_id` where identities are known. Commas,
+    semicolons or tabs separate them. Lines that begin with # are comments.
     """
     rows: dict[int, list[tuple[list[float], str, str]]] = {}
-    reader = csv.reader(_text(path).splitlines())
+    # Comments stay as empty lines, so that the others keep their numbers.
+    lines = ["" if line.lstrip().startswith("#") else line for line in _text(path).splitlines()]
+    first = next((n for n, line in enumerate(lines) if line.strip()), len(lines))
+    named = lines[first] if first < len(lines) else ""
+    reader = csv.reader(lines[first:], delimiter=max(SEPARATORS, key=named.count))
     header = [name.strip() for name in next(reader, [])]
     missing = [name for name in DETECTION_COLUMNS if name not in header]
     if missing:
         raise TumError(
-            f"{path}:1: no column {', '.join(missing)}; the first line must name the columns: "
-            f"{','.join(DETECTION_COLUMNS)}, and object_id where identities are known"
+            f"{path}:{first + 1}: no column {', '.join(missing)}; the first line must name the columns: "
+            f"{','.join(DETECTION_COLUMNS)}, and object_id where identities are known; it is {named[:80]!r}"
         )
     for words in reader:
-        line = reader.line_num
+        line = first + reader.line_num
         if not words:
             continue
         if len(words) != len(header):
-            raise TumError(f"{path}:{line}: {len(words)} values instead of {len(header)}")
+            raise _line_error(path, line, f"{len(words)} values instead of {len(header)}")
         row = dict(zip(header, (word.strip() for word in words), strict=True))
         numbers = [_number(row[name], path, line) for name in DETECTION_COLUMNS[1:6]]
         stamp = _stamp(row["timestamp"], path, line)
@@ -160,21 +173,28 @@ def _boxes(stamp: int, rows: list[tuple[list[float], str, str]], camera: Camera)
 
 def _text(path: Path) -> str:
     try:
-        return path.read_text(encoding="utf-8")
+        return path.read_text(encoding="utf-8-sig")  # some editors begin a file with a mark
     except UnicodeDecodeError:
         raise TumError(f"{path}: not a text file") from None
     except OSError as error:
         raise TumError(f"{path}: cannot be read: {error.strerror}") from None
 
 
+def _line_error(path: Path, line: int, problem: str) -> TumError:
+    """What is wrong in a line; the last one may be there in part only."""
+    text = _text(path)
+    is_cut = line == len(text.splitlines()) and not text.endswith("\n")
+    return TumError(f"{path}:{line}: {problem}{'; is the file complete?' if is_cut else ''}")
+
+
 def _rows(path: Path, columns: int, meaning: str) -> Iterator[tuple[int, list[str]]]:
     """Line number and words of each line that is neither empty nor a comment."""
     for number, line in enumerate(_text(path).splitlines(), start=1):
-        words = line.replace(",", " ").split()
+        words = line.replace(",", " ").replace(";", " ").split()
         if not words or words[0].startswith("#"):
             continue
         if len(words) != columns:
-            raise TumError(f"{path}:{number}: {len(words)} values instead of {columns} ({meaning})")
+            raise _line_error(path, number, f"{len(words)} values instead of {columns} ({meaning})")
         yield number, words
 
 
@@ -183,7 +203,7 @@ def _stamp(word: str, path: Path, line: int) -> int:
     try:
         seconds = Decimal(word)
     except InvalidOperation:
-        raise TumError(f"{path}:{line}: {word!r} is not a number") from None
+        raise _line_error(path, line, f"{word!r} is not a number") from None
     if not seconds.is_finite() or not 0 <= seconds < 2**31:
         raise TumError(f"{path}:{line}: {word} is not a time in seconds")
     return int(seconds.scaleb(9).to_integral_value())
@@ -193,7 +213,7 @@ def _number(word: str, path: Path, line: int) -> float:
     try:
         value = float(word)
     except ValueError:
-        raise TumError(f"{path}:{line}: {word!r} is not a number") from None
+        raise _line_error(path, line, f"{word!r} is not a number") from None
     if not np.isfinite(value):
         raise TumError(f"{path}:{line}: {word} is not a finite number")
     return value

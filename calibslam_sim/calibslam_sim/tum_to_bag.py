@@ -36,6 +36,7 @@ from calibslam_sim.tum_folder import (
 
 TUM_DEPTH_UNITS = 5000.0  # per metre
 ROS_DEPTH_UNITS = 1000.0  # per metre, REP 118
+WRONG_BOXES = 0.1  # share that is no mere error of the detector
 IMAGE_FORMATS = {".jpg": "jpeg", ".jpeg": "jpeg", ".png": "png"}
 
 # Of messages with the same stamp: first what explains the others.
@@ -85,7 +86,9 @@ def items(
     boxes_file = detections or folder / "detections.csv"
     if detections is not None or boxes_file.exists():
         names = None if class_names is None else read_class_names(class_names)
-        for boxes in read_detections(boxes_file, camera):
+        images = read_detections(boxes_file, camera)
+        notes += doubts(boxes_file, images)
+        for boxes in images:
             image_stamps.add(boxes.stamp)
             if names is not None:
                 boxes = replace(boxes, class_ids=tuple(_name(each, names, boxes_file) for each in boxes.class_ids))
@@ -112,6 +115,22 @@ def items(
         add(stamp, topics.CAMERA_INFO, camera_to_msg, camera, stamp, bags.types)
     found.sort(key=lambda item: (item[0], ORDER.index(item[1])))
     return found, notes
+
+
+def doubts(file: Path, images: Sequence[Boxes]) -> list[str]:
+    """Notes on boxes that can hardly be meant as they are written."""
+    if not images:
+        return [f"{file} names columns, but holds no boxes"]
+    corners = np.concatenate([boxes.corners for boxes in images])
+    if (np.abs(corners) <= 1.0).all():
+        return [f"{file}: no corner is above 1: are they shares of the image (normalised)? They must be pixels"]
+    wrong = int((corners[:, 2] <= corners[:, 0]).sum())
+    if wrong > WRONG_BOXES * len(corners):
+        return [
+            f"{file}: xmax is not above xmin in {wrong} of {len(corners)} boxes: are they x, y, width, height (xywh)? "
+            "They must be xmin, ymin, xmax, ymax"
+        ]
+    return []
 
 
 def _camera(folder: Path, name: str | None) -> Camera:
