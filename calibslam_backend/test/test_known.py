@@ -87,6 +87,21 @@ def test_together_they_are_what_was_known(n: int) -> None:
         assert np.linalg.eigvalsh(found.quadrics[j].covariance)[0] > 0.0
 
 
+@pytest.mark.parametrize("away", [1e2, 1e4])
+def test_far_away_they_are_known_as_well(away: float) -> None:
+    """A small turn of the map is there a shift of kilometres, beside which quadrics are known to a centimetre."""
+    vectors = quadrics(8)
+    for vector in vectors:
+        vector[0] += away
+    blocks = blocks_of(covariance(vectors, FRAME), 9)
+    found = prior_of(range(8), vectors, blocks)
+    for j, known in found.quadrics.items():
+        np.testing.assert_allclose(found.covariance(j), blocks[j, j], atol=1e-4 * np.abs(blocks[j, j]).max())
+        assert np.linalg.eigvalsh(known.covariance)[0] > 0.0
+        if known.parent is not None:
+            conditional(known, found.quadrics[known.parent])
+
+
 def test_the_motion_of_the_map_is_found() -> None:
     """With many quadrics it is known as well as it is: what each errs by itself averages out."""
     vectors = quadrics(40)

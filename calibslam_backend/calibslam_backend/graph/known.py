@@ -22,13 +22,14 @@ and each pair of neighbours in the tree, is known as well as it was. Given its p
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import gtsam
 import numpy as np
 from scipy.sparse.csgraph import breadth_first_order, minimum_spanning_tree
 
 from calibslam_backend.geometry.ellipsoid import matrix_from_vector, vector_from_matrix
+from calibslam_msgs_py.covariance import symmetric
 from calibslam_msgs_py.measurements import Array
 
 # Information on a motion of the map that there is in any case: 10 rad and 1 km.
@@ -98,13 +99,29 @@ def prior_of(quadrics: Sequence[int], vectors: Sequence[Array], blocks: Array) -
     n = len(quadrics)
     G = np.concatenate([moved_with_map(vector) for vector in vectors])
     S = blocks.swapaxes(1, 2).reshape(9 * n, 9 * n)
-    frame = np.linalg.inv(G.T @ np.linalg.solve(S, G) + np.diag(UNKNOWN_FRAME))
-    R = S - G @ frame @ G.T + LEAST * np.eye(9 * n)
+    weighted, little = np.linalg.solve(S, G), np.diag(UNKNOWN_FRAME)
+    F = np.linalg.inv(symmetric(G.T @ weighted) + little)
+    # S - G F G^T as a square, since far from the origin the difference is much smaller than what it is of; the little
+    # information that there is in any case is then one of F.
+    rest = np.eye(9 * n) - G @ F @ weighted.T
+    R = rest @ S @ rest.T + LEAST * np.eye(9 * n)
+    frame = np.asarray(F + F @ little @ F)
     left = R.reshape(n, 9, n, 9).swapaxes(1, 2)
     known = {quadrics[0]: Known(vectors[0], left[0, 0])}
     for child, parent in tree(left):
-        known[quadrics[child]] = Known(vectors[child], left[child, child], quadrics[parent], left[child, parent])
+        j, p, alone = quadrics[child], quadrics[parent], Known(vectors[child], left[child, child])
+        depending = replace(alone, parent=p, cross=left[child, parent])
+        known[j] = depending if _is_one_distribution(depending, known[p]) else alone
     return MapPrior(frame, known)
+
+
+def _is_one_distribution(known: Known, parent: Known) -> bool:
+    """Rounding can make it none."""
+    try:
+        conditional(known, parent)
+    except ValueError:
+        return False
+    return True
 
 
 def tree(blocks: Array) -> list[tuple[int, int]]:
