@@ -11,10 +11,10 @@ from pathlib import Path
 
 import numpy as np
 
-from calibslam_backend.doubts import Course, doubts
 from calibslam_backend.estimator import Estimator, EstimatorSettings
 from calibslam_backend.geometry.transform import transform_from_text
 from calibslam_backend.keyframe import Keyframe
+from calibslam_backend.output.doubts import Course, doubts
 from calibslam_backend.output.metrics import Trajectory
 from calibslam_backend.output.object_map import ObjectMap
 from calibslam_backend.output.published import POSE, TRANSFORM, camera_transform_message, map_messages, pose_message

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from calibslam_backend.doubts import Course, doubts
+from calibslam_backend.output.doubts import Course, doubts
 from calibslam_msgs_py.measurements import SECOND
 
 # fr1_desk with real odometry and boxes, which fails now and then.
