@@ -85,7 +85,11 @@ def covariance_of_pose_and_radii(vector: Array, covariance: Array) -> Array:
 
 
 def covariance_of_vector(T_map_object: Array, radii: Array, covariance: Array) -> Array:
-    """The inverse of `covariance_of_pose_and_radii`: covariance (9, 9) of (t, L), positive definite."""
+    """`covariance_of_pose_and_radii` turned back: covariance (9, 9) of (t, L), positive definite.
+
+    Where radii are nearly equal, that says less than there was, as no rotation is less certain than uniform: L comes
+    back too sure. What is to be gone on with is kept as it is (`known`).
+    """
     R, l = T_map_object[:3, :3], np.log(radii)  # noqa: E741
     J = np.zeros((9, 9))
     J[:3, 3:6] = R
