@@ -4,9 +4,9 @@ Two conditions see the same worlds and the same unit noise, so the test is on th
 and beside it Wilcoxon's signed ranks, which a few large differences cannot decide. Both two-sided.
 
 Repetitions that each leave out another share f of one recording have the rest in common: their differences scatter far
-less than those of separate recordings, and a test that took them for independent would find everything significant. The
-mean of all then has (1 - f) / f times the variance of one of them (delete-d jackknife; Shao and Wu 1989), however many
-there are.
+less than those of separate recordings, and a test that took them for independent would find everything significant. Of
+the whole recording's value, the variance is (1 - f) / f times theirs (delete-d jackknife; Shao and Wu 1989), and the mean
+of n of them misses that value by a further n-th part.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ def paired(a: Sequence[float], b: Sequence[float], left_out: float = 0.0) -> dic
 
 def standard_error(values: Array, left_out: float = 0.0) -> float:
     """Of the mean of at least two values; `left_out` as in `paired`."""
-    share = (1.0 - left_out) / left_out if left_out else 1.0 / len(values)
+    share = 1.0 / len(values) + ((1.0 - left_out) / left_out if left_out else 0.0)
     return float(values.std(ddof=1) * np.sqrt(share))
 
 

@@ -99,8 +99,8 @@ class TumSettings(ExperimentSettings):
     good_trajectory: str = setting("reference_orbslam.txt", "file in the folder of which noisy odometry is made")
     rotation_noise: float = setting(0.5, "added to each step of it, about each axis", unit="deg", low=1e-4)
     translation_noise: float = setting(0.01, "added to each step of it, along each axis", unit="m", low=1e-6)
-    left_out: float = setting(0.1, "share of images left out where odometry is real", low=0.0, high=0.9)
-    left_out_of_few: float = setting(2.0 / 3.0, "the same in `few_` conditions", low=0.0, high=0.9)
+    left_out: float = setting(0.1, "share of images left out where odometry is real", low=0.01, high=0.9)
+    left_out_of_few: float = setting(2.0 / 3.0, "the same in `few_` conditions", low=0.01, high=0.9)
     left_out_objects: float = setting(1.0 / 3.0, "share of objects left out in `sparse_` conditions", low=0.0, high=0.9)
     most_images: int = setting(1_000_000, "of the recording, from its beginning", low=10)
 

@@ -92,7 +92,13 @@ class CocoWriter:
             "annotations": self._annotations,
             "categories": [{"id": k + 1, "name": name} for k, name in enumerate(CLASSES)],
         }
-        (self._folder / ANNOTATIONS).write_text(json.dumps(content), encoding="utf-8")
+        # A cut file would tell nobody which images are ours.
+        partial = self._folder / f"{ANNOTATIONS}.part"
+        try:
+            partial.write_text(json.dumps(content), encoding="utf-8")
+            partial.replace(self._folder / ANNOTATIONS)
+        finally:
+            partial.unlink(missing_ok=True)
         return len(self._images)
 
 
