@@ -222,17 +222,19 @@ class Estimator:
         estimated until two images, at least `MapSearch.SIGHTINGS_APART` apart, agree on where it is.
 
         Raises:
-            ValueError: a quadric has no covariance that it could begin with, or its id is there twice; nothing is
-                changed.
+            ValueError: a quadric has no covariance that it could begin with, its id is there twice, or priors do not
+                fit each other; nothing is changed.
         """
         quadrics = {quadric.id: quadric for quadric in known.quadrics}
         if len(quadrics) < len(known.quadrics):
             raise ValueError("two quadrics of the map have the same id")
         if known.prior.quadrics.keys() - quadrics:
             raise ValueError("the prior of the map knows quadrics that the map does not have")
+        known.prior.check()
         alone = {j: _known_alone(quadric) for j, quadric in quadrics.items() if j not in known.prior.quadrics}
         self.reset()
-        self._graph.frame = known.prior.frame
+        if quadrics:
+            self._graph.frame = known.prior.frame
         if quadrics and self.settings.start_in_map == FOUND:
             self._search.search()
         for j, prior in {**known.prior.quadrics, **alone}.items():

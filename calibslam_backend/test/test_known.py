@@ -2,13 +2,23 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import gtsam
 import numpy as np
 import pytest
 
 from calibslam_backend.geometry.ellipsoid import Ellipsoid
 from calibslam_backend.graph.keys import q
-from calibslam_backend.graph.known import Known, conditional, conditional_factor, moved_with_map, prior_of, tree
+from calibslam_backend.graph.known import (
+    Known,
+    MapPrior,
+    conditional,
+    conditional_factor,
+    moved_with_map,
+    prior_of,
+    tree,
+)
 from calibslam_msgs_py.measurements import Array
 
 
@@ -83,7 +93,7 @@ def test_together_they_are_what_was_known(n: int) -> None:
     found = prior_of(ids, vectors, blocks)
     assert sorted(found.quadrics) == ids
     for i, j in enumerate(ids):
-        np.testing.assert_allclose(found.covariance(j), blocks[i, i], atol=2e-8)
+        np.testing.assert_allclose(found.with_frame()[j].covariance, blocks[i, i], atol=2e-8)
         assert np.linalg.eigvalsh(found.quadrics[j].covariance)[0] > 0.0
 
 
@@ -95,8 +105,9 @@ def test_far_away_they_are_known_as_well(away: float) -> None:
         vector[0] += away
     blocks = blocks_of(covariance(vectors, FRAME), 9)
     found = prior_of(range(8), vectors, blocks)
+    whole = found.with_frame()
     for j, known in found.quadrics.items():
-        np.testing.assert_allclose(found.covariance(j), blocks[j, j], atol=1e-4 * np.abs(blocks[j, j]).max())
+        np.testing.assert_allclose(whole[j].covariance, blocks[j, j], atol=1e-4 * np.abs(blocks[j, j]).max())
         assert np.linalg.eigvalsh(known.covariance)[0] > 0.0
         if known.parent is not None:
             conditional(known, found.quadrics[known.parent])
@@ -128,6 +139,29 @@ def test_the_graph_of_the_tree_has_these_covariances() -> None:
         if known.parent is not None:
             both = marginals.jointMarginalCovariance([q(j), q(known.parent)])
             np.testing.assert_allclose(both.at(q(j), q(known.parent)), known.cross, atol=1e-9)
+
+
+def test_a_motion_that_no_quadric_tells_is_not_known() -> None:
+    """A ball that is turned about its centre is the same: nothing is said of such turns, instead of any number."""
+    ball = np.zeros(9)
+    ball[:3] = 0.0, 0.0, 5.0
+    found = prior_of([3], [ball], np.eye(9)[None, None] * 0.01)
+    assert np.trace(found.frame) < 0.1
+    np.testing.assert_allclose(found.with_frame()[3].covariance, np.eye(9) * 0.01, atol=2e-8)
+
+
+def test_what_depends_on_nothing_or_on_itself_is_refused() -> None:
+    own = Known(np.zeros(9), np.eye(9))
+    for quadrics in ({1: replace(own, parent=1)}, {1: replace(own, parent=2), 2: own}):
+        with pytest.raises(ValueError, match="depends on one that has none, or on itself"):
+            MapPrior(np.zeros((6, 6)), quadrics).check()
+
+
+@pytest.mark.parametrize("size", [1e200, 1e308, np.nan])
+def test_covariances_beyond_all_numbers_are_refused(size: float) -> None:
+    own = Known(np.zeros(9), np.eye(9))
+    with pytest.raises(ValueError, match="larger than their own allow"):
+        conditional(replace(own, parent=0, cross=np.full((9, 9), size)), own)
 
 
 def test_covariances_that_cannot_be_are_refused() -> None:

@@ -11,9 +11,9 @@ from calibslam_backend.estimator_settings import EstimatorSettings
 from calibslam_backend.geometry.box_measurement import BoxMeasurement
 from calibslam_backend.geometry.ellipsoid import Ellipsoid
 from calibslam_backend.geometry.visible_box import ALL_EDGES, box_of_visible_part, image_bounds
-from calibslam_backend.graph.known import Known
+from calibslam_backend.graph.known import Known, MapPrior, moved_with_map, prior_of
 from calibslam_backend.graph.measured import Motion
-from calibslam_backend.graph.object_graph import ObjectGraph
+from calibslam_backend.graph.object_graph import T_MAP_FIRST_CAMERA, ObjectGraph
 from calibslam_backend.kernels import load_kernels
 from calibslam_msgs_py.measurements import Array
 
@@ -80,3 +80,61 @@ def test_a_motion_that_is_none_changes_nothing() -> None:
     assert graph.add_pose(motion(TURN, 0.01), graph.pose(10) @ TURN) == 11
     graph.update()
     np.testing.assert_allclose(graph.pose(11), poses[10] @ TURN, atol=1e-6)
+
+
+def known_map() -> tuple[ObjectGraph, MapPrior]:
+    """A graph of nothing, and five cups of a map that is moved as a whole and err by a centimetre each."""
+    load_kernels()
+    settings = EstimatorSettings(box_correlation=False)
+    vectors = []
+    for j in range(5):
+        T = T_MAP_FIRST_CAMERA.copy()
+        T[:3, 3] = 2.0 + 0.3 * (j % 2), 0.25 * (j - 2), 0.1 * j
+        vectors.append(Ellipsoid(T, np.array([0.05, 0.08, 0.1])).vector())
+    G = np.concatenate([moved_with_map(vector) for vector in vectors])
+    S = G @ np.diag([0.02**2] * 3 + [0.05**2] * 3) @ G.T + np.eye(45) * 1e-4
+    prior = prior_of(range(5), vectors, S.reshape(5, 9, 5, 9).swapaxes(1, 2))
+    graph = ObjectGraph(CAMERA.K, settings, settings, settings)
+    graph.frame = prior.frame
+    for j, known in prior.quadrics.items():
+        graph.add_known_quadric(j, known)
+    return graph, prior
+
+
+def test_a_camera_at_the_origin_tells_where_the_map_is() -> None:
+    """It sees the map moved, which then is where it sees it, and as sure as it is of itself."""
+    graph, prior = known_map()
+    graph.add_origin()
+    off = gtsam.Pose3.Expmap(np.array([0.01, -0.02, 0.015, 0.05, -0.03, 0.04]))
+    true = {}
+    for j, known in prior.quadrics.items():
+        ellipsoid = Ellipsoid.from_vector(known.vector)
+        true[j] = Ellipsoid(off.matrix() @ ellipsoid.T_world_object, ellipsoid.radii).vector()
+        corners = box_of_visible_part(T_MAP_FIRST_CAMERA, true[j], CAMERA.K, BOUNDS, ~ALL_EDGES)[1]
+        graph.add_box(0, j, BoxMeasurement(corners, np.eye(4), BOUNDS, ~ALL_EDGES))
+    graph.update()
+    for _ in range(3):
+        graph.iterate()
+    np.testing.assert_allclose(graph.pose(0), T_MAP_FIRST_CAMERA, atol=2e-3)
+    assert not graph.frame.any() and np.sqrt(np.diag(graph.pose_covariance(0))).max() < 2e-3
+    for j, vector in true.items():
+        error = vector - graph.quadric(j)
+        assert error @ np.linalg.solve(graph.quadric_covariances()[j], error) < 9.0
+
+
+def test_without_the_quadric_that_others_depend_on() -> None:
+    """They are still known as well as they were, at once and after the next update."""
+    graph, prior = known_map()
+    graph.add_origin(T_MAP_FIRST_CAMERA)
+    graph.update()
+    root = next(j for j, known in prior.quadrics.items() if known.parent is None)
+    before = graph.quadric_covariances()
+    graph.remove_quadric(root)
+    children = [j for j, known in prior.quadrics.items() if known.parent == root]
+    assert children and all(graph.is_solved(j) for j in children)
+    assert graph.known().quadrics.keys() == before.keys() - {root}
+    graph.update()
+    after = graph.quadric_covariances()
+    for j in children:
+        np.testing.assert_allclose(after[j], before[j], atol=0.1 * np.abs(before[j]).max())
+    graph.known().check()

@@ -31,7 +31,7 @@ from calibslam_backend.association.tracking import overlap
 from calibslam_backend.estimator_settings import EstimatorSettings
 from calibslam_backend.geometry.box_measurement import BoxMeasurement, cut_alike, prepare, undistorted
 from calibslam_backend.graph.measured import Motion
-from calibslam_backend.graph.noise import box_covariance, spread
+from calibslam_backend.graph.noise import QUADRICSLAM, box_covariance, spread
 from calibslam_backend.graph.object_graph import ObjectGraph, UpdateReport
 from calibslam_msgs_py.measurements import Array, Boxes, Camera
 
@@ -66,8 +66,11 @@ class DataAssociation:
         covariances = np.empty((len(boxes), 4, 4))
         corners = undistorted(boxes.corners, self.camera)
         for i, track in enumerate(tracks):
-            before = [box.corners for box in self._assignments.boxes_of_object(track)]
-            covariances[i] = box_covariance(self.settings, boxes.covariances[i], [*before, corners[i]])
+            # Only one model asks, and there may be thousands.
+            is_asked = self.settings.noise_model == QUADRICSLAM
+            before = self._assignments.boxes_of_object(track) if is_asked else []
+            so_far = [*(box.corners for box in before), corners[i]]
+            covariances[i] = box_covariance(self.settings, boxes.covariances[i], so_far)
         measurements = prepare(boxes, covariances, self.camera)
         return Frame(measurements, tracks, boxes.class_ids, boxes.object_ids, [None] * len(boxes))
 

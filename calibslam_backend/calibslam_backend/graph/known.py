@@ -32,8 +32,8 @@ from calibslam_backend.geometry.ellipsoid import matrix_from_vector, vector_from
 from calibslam_msgs_py.covariance import symmetric
 from calibslam_msgs_py.measurements import Array
 
-# Information on a motion of the map that there is in any case: 10 rad and 1 km.
-UNKNOWN_FRAME = np.array([1e-2] * 3 + [1e-6] * 3)
+# Deviations of a motion of the map [rad, m]: of more, nothing is known.
+LARGEST_MOTION = np.array([1.0] * 3 + [100.0] * 3)
 LEAST = 1e-8  # variance [m^2] that is left of every number, where the motion of the map tells all of it
 
 
@@ -66,11 +66,28 @@ class MapPrior:
     frame: Array
     quadrics: Mapping[int, Known]
 
-    def covariance(self, j: int) -> Array:
-        """(9, 9) of a quadric, all that it errs by."""
-        known = self.quadrics[j]
-        G = moved_with_map(known.vector)
-        return np.asarray(known.covariance + G @ self.frame @ G.T)
+    def with_frame(self) -> dict[int, Known]:
+        """The quadrics with all that they err by."""
+        G = {j: moved_with_map(known.vector) for j, known in self.quadrics.items()}
+        whole = {}
+        for j, known in self.quadrics.items():
+            whole[j] = replace(known, covariance=known.covariance + G[j] @ self.frame @ G[j].T)
+            if known.parent is not None:
+                whole[j] = replace(whole[j], cross=known.cross + G[j] @ self.frame @ G[known.parent].T)
+        return whole
+
+    def check(self) -> None:
+        """Raises ValueError if a quadric depends on one that is not there before it, or as `conditional`."""
+        done: dict[int, Known] = {}
+        for j, known in self.quadrics.items():
+            if known.parent is not None:
+                if known.parent not in done:
+                    raise ValueError(f"the prior of quadric {j} depends on one that has none, or on itself")
+                try:
+                    conditional(known, done[known.parent])
+                except ValueError as error:
+                    raise ValueError(f"the prior of quadric {j}: {error}") from None
+            done[j] = known
 
 
 NOTHING_KNOWN = MapPrior(np.zeros((6, 6)), {})
@@ -99,13 +116,11 @@ def prior_of(quadrics: Sequence[int], vectors: Sequence[Array], blocks: Array) -
     n = len(quadrics)
     G = np.concatenate([moved_with_map(vector) for vector in vectors])
     S = blocks.swapaxes(1, 2).reshape(9 * n, 9 * n)
-    weighted, little = np.linalg.solve(S, G), np.diag(UNKNOWN_FRAME)
-    F = np.linalg.inv(symmetric(G.T @ weighted) + little)
-    # S - G F G^T as a square, since far from the origin the difference is much smaller than what it is of; the little
-    # information that there is in any case is then one of F.
-    rest = np.eye(9 * n) - G @ F @ weighted.T
+    weighted = np.linalg.solve(S, G)
+    frame = _covariance_of_frame(symmetric(G.T @ weighted))
+    # S - G F G^T as a square: far from the origin the difference is much smaller than what it is of.
+    rest = np.eye(9 * n) - G @ frame @ weighted.T
     R = rest @ S @ rest.T + LEAST * np.eye(9 * n)
-    frame = np.asarray(F + F @ little @ F)
     left = R.reshape(n, 9, n, 9).swapaxes(1, 2)
     known = {quadrics[0]: Known(vectors[0], left[0, 0])}
     for child, parent in tree(left):
@@ -113,6 +128,13 @@ def prior_of(quadrics: Sequence[int], vectors: Sequence[Array], blocks: Array) -
         depending = replace(alone, parent=p, cross=left[child, parent])
         known[j] = depending if _is_one_distribution(depending, known[p]) else alone
     return MapPrior(frame, known)
+
+
+def _covariance_of_frame(information: Array) -> Array:
+    """F (6, 6), in those directions that the quadrics tell: of balls in a row, a turn about it is none of them."""
+    scale = np.outer(LARGEST_MOTION, LARGEST_MOTION)
+    told, axes = np.linalg.eigh(scale * information)
+    return np.asarray(scale * ((axes * np.where(told > 1.0, 1.0 / np.maximum(told, 1.0), 0.0)) @ axes.T))
 
 
 def _is_one_distribution(known: Known, parent: Known) -> bool:
@@ -132,13 +154,14 @@ def tree(blocks: Array) -> list[tuple[int, int]]:
     """
     n, d = len(blocks), blocks.shape[-1]
     own = np.linalg.slogdet(blocks[range(n), range(n)])[1]
-    i, j = np.triu_indices(n, 1)
-    pairs = np.empty((len(i), 2 * d, 2 * d))
-    pairs[:, :d, :d], pairs[:, :d, d:] = blocks[i, i], blocks[i, j]
-    pairs[:, d:, :d], pairs[:, d:, d:] = blocks[j, i], blocks[j, j]
-    shared = 0.5 * (own[i] + own[j] - np.linalg.slogdet(pairs)[1])
     weights = np.zeros((n, n))
-    weights[i, j] = -1.0 - np.maximum(shared, 0.0)  # of independent variables too: zero would be no edge
+    for i in range(n - 1):
+        others = range(i + 1, n)
+        pairs = np.empty((n - 1 - i, 2 * d, 2 * d))
+        pairs[:, :d, :d], pairs[:, :d, d:] = blocks[i, i], blocks[i, others]
+        pairs[:, d:, :d], pairs[:, d:, d:] = blocks[others, i], blocks[others, others]
+        shared = 0.5 * (own[i] + own[others] - np.linalg.slogdet(pairs)[1])
+        weights[i, others] = -1.0 - np.maximum(shared, 0.0)  # of independent variables too: zero would be no edge
     order, parents = breadth_first_order(minimum_spanning_tree(weights), 0, directed=False)
     return [(int(child), int(parents[child])) for child in order[1:]]
 
@@ -149,11 +172,16 @@ def conditional(known: Known, parent: Known) -> tuple[Array, Array]:
     Raises:
         ValueError: the two covariances and the one between them are none of one distribution.
     """
-    A = np.linalg.solve(parent.covariance, known.cross.T).T
+    refused = ValueError("its covariance with its parent is larger than their own allow")
+    with np.errstate(over="ignore", invalid="ignore"):
+        A = np.linalg.solve(parent.covariance, known.cross.T).T
+        left = known.covariance - A @ known.cross.T
+    if not np.isfinite(left).all():
+        raise refused
     try:
-        root = np.linalg.cholesky(known.covariance - A @ known.cross.T)
+        root = np.linalg.cholesky(left)
     except np.linalg.LinAlgError:
-        raise ValueError("its covariance with its parent is larger than their own allow") from None
+        raise refused from None
     return np.asarray(A), np.asarray(np.linalg.inv(root))
 
 

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Hashable, Iterable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import gtsam
 import numpy as np
@@ -148,7 +148,7 @@ class ObjectGraph:
 
     def is_solved(self, j: int) -> bool:
         """Whether a quadric has gone through an update, and so has covariances."""
-        return self._smoother.has(("prior", j))
+        return self._smoother.is_solved(q(j))
 
     def pose_covariance(self, k: int) -> Array:
         """(6, 6) [rotation, translation] of keyframe k in its body, with what the tree understates of errors that are
@@ -206,10 +206,21 @@ class ObjectGraph:
         if found is None:
             noise = gtsam.noiseModel.Isotropic.Sigma(6, sigma)
             self._smoother.add("origin", gtsam.PriorFactorPose3(x(0), origin, noise))
+            self._take_frame_back()
         else:
             noise = gtsam.noiseModel.Isotropic.Sigma(3, sigma)
             self._smoother.add("origin", gtsam.PoseRotationPrior3D(x(0), origin, noise))
             self._find_beside()
+
+    def _take_frame_back(self) -> None:
+        """A camera at the map's origin does tell a motion of the whole map: it is an error of the quadrics again."""
+        known = {j: landmark.prior for j, landmark in self.landmarks.items()}
+        for j, prior in MapPrior(self.frame, known).with_frame().items():
+            self.landmarks[j].prior = prior
+        if self.frame.any():
+            for j in known:
+                self._renew_prior(j)
+        self.frame = np.zeros((6, 6))
 
     def _find_beside(self) -> None:
         """The first pose is where it was found, seen from the nearest quadric that there was."""
@@ -259,6 +270,10 @@ class ObjectGraph:
         self._smoother.insert(q(j), known.vector)
         self._smoother.add(("prior", j), factor)
 
+    def _renew_prior(self, j: int) -> None:
+        self._smoother.remove(("prior", j))
+        self._smoother.add(("prior", j), self._prior_factor(j, self.landmarks[j].prior))
+
     def _prior_factor(self, j: int, known: Known) -> gtsam.NonlinearFactor:
         if known.parent is not None:
             return conditional_factor(q(j), known, q(known.parent), self.landmarks[known.parent].prior)
@@ -286,9 +301,8 @@ class ObjectGraph:
         self._smoother.remove(("prior", j))
         for child, landmark in self.landmarks.items():
             if landmark.prior.parent == j:
-                landmark.prior = replace(landmark.prior, parent=None)
-                self._smoother.remove(("prior", child))
-                self._smoother.add(("prior", child), self._prior_factor(child, landmark.prior))
+                landmark.prior = Known(landmark.prior.vector, landmark.prior.covariance)
+                self._renew_prior(child)
         if self._beside == j:
             self._smoother.remove("beside")
             self._find_beside()

@@ -91,6 +91,10 @@ class Smoother:
         """Whether a factor is in the tree, updates done."""
         return name in self._slots
 
+    def is_solved(self, key: int) -> bool:
+        """Whether a variable is in the tree, updates done."""
+        return bool(self.values.exists(key)) and not self._new_values.exists(key)
+
     # -- solving ------------------------------------------------------------------------------------------------
 
     def update(self, last: Iterable[int], held: Iterable[int]) -> None:

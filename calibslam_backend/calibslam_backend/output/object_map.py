@@ -13,8 +13,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from calibslam_backend.geometry.ellipsoid import Ellipsoid
-from calibslam_backend.graph.known import NOTHING_KNOWN, Known, MapPrior, conditional
-from calibslam_msgs_py.covariance import SYMMETRY_TOLERANCE, is_covariance
+from calibslam_backend.graph.known import NOTHING_KNOWN, Known, MapPrior
+from calibslam_msgs_py.covariance import LARGEST_VARIANCE, SYMMETRY_TOLERANCE, is_covariance
 from calibslam_msgs_py.measurements import SECOND, Array, QuadricEstimate
 
 FORMAT, VERSION = "calibslam-map", 1
@@ -130,7 +130,8 @@ class ObjectMap:
                 raise ValueError(f"quadrics: id {twice[0]} is there {ids[twice[0]]} times")
             priors = dict(_each(content, "quadrics", _own_prior))
             known = _in_order({j: prior for j, prior in priors.items() if prior is not None})
-            frame = _frame(content)
+            prior = MapPrior(_frame(content), known)
+            prior.check()
         except KeyError as error:
             raise _damaged(path, f"it has no {error}") from None
         except ValueError as error:
@@ -141,7 +142,7 @@ class ObjectMap:
             np.reshape([covariance for _, _, covariance in keyframes], (-1, 6, 6)),
             tuple(quadrics),
             camera,
-            MapPrior(frame, known),
+            prior,
         )
 
 
@@ -213,8 +214,11 @@ def _frame(content: dict[str, Any]) -> Array:
     if "frame_covariance" not in content:
         return NOTHING_KNOWN.frame
     covariance = _numbers(content, "frame_covariance", (6, 6))
-    if not np.allclose(covariance, covariance.T) or np.linalg.eigvalsh(covariance)[0] < -1e-9 * np.trace(covariance):
-        raise ValueError("frame_covariance is not symmetric and positive semidefinite")
+    largest = np.trace(covariance)
+    if largest > LARGEST_VARIANCE or not np.allclose(covariance, covariance.T, atol=1e-9 * abs(largest)):
+        raise ValueError("frame_covariance is not symmetric and of sensible size")
+    if np.linalg.eigvalsh(covariance)[0] < -1e-9 * largest:
+        raise ValueError("frame_covariance is not positive semidefinite")
     return covariance
 
 
@@ -245,20 +249,17 @@ def _own_prior(entry: dict[str, Any]) -> tuple[int, Known | None]:
 
 
 def _in_order(priors: dict[int, Known]) -> dict[int, Known]:
-    """Parents before those that depend on them."""
+    """Parents before those that depend on them; one whose parent has none is known by itself."""
     result: dict[int, Known] = {}
-    left = dict(priors)
+    left = {
+        j: known if known.parent is None or known.parent in priors else Known(known.vector, known.covariance)
+        for j, known in priors.items()
+    }
     while left:
         ready = [j for j, known in left.items() if known.parent is None or known.parent in result]
         if not ready:
-            raise ValueError(f"the prior of quadric {next(iter(left))} depends on one that has none, or on itself")
-        for j in ready:
-            known = result[j] = left.pop(j)
-            if known.parent is not None:
-                try:
-                    conditional(known, result[known.parent])
-                except ValueError as error:
-                    raise ValueError(f"the prior of quadric {j}: {error}") from None
+            raise ValueError(f"the prior of quadric {next(iter(left))} depends on itself")
+        result.update({j: left.pop(j) for j in ready})
     return result
 
 

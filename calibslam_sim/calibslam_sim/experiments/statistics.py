@@ -5,8 +5,8 @@ and beside it Wilcoxon's signed ranks, which a few large differences cannot deci
 
 Repetitions that each leave out another share f of one recording have the rest in common: their differences scatter far
 less than those of separate recordings, and a test that took them for independent would find everything significant. Of
-the whole recording's value, the variance is (1 - f) / f times theirs (delete-d jackknife; Shao and Wu 1989), and the mean
-of n of them misses that value by a further n-th part.
+the whole recording's value, the variance is (1 - f) / f times theirs (delete-d jackknife; Shao and Wu 1989), and the
+mean of n of them misses that value by a further n-th part.
 """
 
 from __future__ import annotations
