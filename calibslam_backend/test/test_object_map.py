@@ -12,7 +12,9 @@ import numpy as np
 import pytest
 from evo.tools import file_interface
 
+from calibslam_backend.geometry.ellipsoid import Ellipsoid
 from calibslam_backend.geometry.transform import transform_from_text
+from calibslam_backend.graph.known import Known, MapPrior
 from calibslam_backend.output.object_map import MapFileError, ObjectMap, tum_lines
 from calibslam_msgs_py.measurements import Array, QuadricEstimate
 
@@ -31,7 +33,10 @@ def some_map() -> ObjectMap:
         QuadricEstimate(7 + i, ("cup", "Tasse ☕")[i], T, rng.uniform(0.01, 1.0, 3), b @ b.T, 10 + i)
         for i, (T, b) in enumerate(zip(poses(2, 2), B, strict=True))
     )
-    return ObjectMap(STAMPS, poses(3), A @ A.transpose(0, 2, 1), quadrics, "front_camera")
+    first, second = (Ellipsoid(quadric.T_map_object, quadric.radii).vector() for quadric in quadrics)
+    known = {7: Known(first, np.eye(9) * 0.04), 8: Known(second, np.eye(9) * 0.09, 7, np.eye(9) * 0.03)}
+    prior = MapPrior(np.diag(rng.uniform(0.1, 1.0, 6)), known)
+    return ObjectMap(STAMPS, poses(3), A @ A.transpose(0, 2, 1), quadrics, "front_camera", prior)
 
 
 def test_what_is_saved_is_loaded(tmp_path: Path) -> None:
@@ -46,6 +51,28 @@ def test_what_is_saved_is_loaded(tmp_path: Path) -> None:
         np.testing.assert_allclose(a.T_map_object, b.T_map_object, atol=1e-12)
         np.testing.assert_array_equal(a.radii, b.radii)
         np.testing.assert_array_equal(a.covariance, b.covariance)
+    np.testing.assert_array_equal(loaded.prior.frame, saved.prior.frame)
+    assert list(loaded.prior.quadrics) == list(saved.prior.quadrics)
+    for j, known in loaded.prior.quadrics.items():
+        there = saved.prior.quadrics[j]
+        assert known.parent == there.parent
+        for name in ("vector", "covariance", "cross"):
+            np.testing.assert_array_equal(getattr(known, name), getattr(there, name))
+
+
+def test_maps_without_priors_and_quadrics_whose_parent_has_none(tmp_path: Path) -> None:
+    """As earlier versions wrote them, or where somebody has moved an object and left its prior out, as he was told."""
+    path = tmp_path / "map.json"
+    some_map().save(path)
+    content = json.loads(path.read_text())
+    del content["quadrics"][0]["prior"]
+    path.write_text(json.dumps(content))
+    (alone,) = ObjectMap.load(path).prior.quadrics.values()
+    assert alone.parent is None and not alone.cross.any()
+    del content["quadrics"][1]["prior"], content["frame_covariance"]
+    path.write_text(json.dumps(content))
+    prior = ObjectMap.load(path).prior
+    assert not prior.quadrics and not prior.frame.any()
 
 
 def test_saving_twice_gives_the_same_bytes_and_leaves_nothing_behind(tmp_path: Path) -> None:
@@ -110,6 +137,17 @@ DAMAGES = {
     "an infinite id": (set_in("quadrics.0.id", 1e999), "id inf is no whole number"),
     "an id that no message holds": (set_in("quadrics.0.id", 2**60), "id 1152921504606846976 is no whole number"),
     "half an observation": (set_in("quadrics.0.observations", 0.5), "observations 0.5 is no whole number"),
+    "a prior of elsewhere": (set_in("quadrics.0.prior.vector.0", 9.0), r"\(id 7\): its prior is of another position"),
+    "a prior of nothing": (set_in("quadrics.0.prior", 3), r"\(id 7\): its prior is no object of JSON"),
+    "a negative prior": (set_in("quadrics.0.prior.covariance.0", -1.0), "the covariance of its prior is not"),
+    "a prior of its own": (set_in("quadrics.0.prior.parent", 7), "prior of quadric 7 depends on itself"),
+    "too large a cross": (
+        set_in("quadrics.1.prior.cross_covariance.0", 0.07),
+        "prior of quadric 8: its covariance with",
+    ),
+    "a huge cross": (set_in("quadrics.1.prior.cross_covariance.0", 1e308), "prior of quadric 8: its covariance with"),
+    "a huge frame": (set_in("frame_covariance.0", 1e300), "frame_covariance is not symmetric and of sensible size"),
+    "a negative frame": (set_in("frame_covariance.0", -0.5), "frame_covariance is not positive semidefinite"),
     "half a character": (set_in("quadrics.0.class_id", "\ud800"), "class_id .* is no text"),
 }
 
