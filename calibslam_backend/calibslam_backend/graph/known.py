@@ -5,8 +5,9 @@ would tell sqrt(N) times better than any of them where the map is, and a map tha
 become surer each time, of nothing.
 
 What all have in common is a motion g of the whole map. Nothing that is seen in the map can tell it any more, so it is
-taken out. With G the derivative of all quadrics by g, the best estimate of g from their errors (Gauss and Markov) has
-the covariance F = (G^T S^-1 G)^-1 and does not correlate with what is left of them, so that exactly
+taken out. (A camera that begins at the map's origin can: there it is an error of the quadrics again.) With G the
+derivative of all quadrics by g, the best estimate of g from their errors (Gauss and Markov) has the covariance
+F = (G^T S^-1 G)^-1 and does not correlate with what is left of them, so that exactly
 
     S = G F G^T + R.
 
