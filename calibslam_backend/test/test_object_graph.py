@@ -11,6 +11,7 @@ from calibslam_backend.estimator_settings import EstimatorSettings
 from calibslam_backend.geometry.box_measurement import BoxMeasurement
 from calibslam_backend.geometry.ellipsoid import Ellipsoid
 from calibslam_backend.geometry.visible_box import ALL_EDGES, box_of_visible_part, image_bounds
+from calibslam_backend.graph import object_graph
 from calibslam_backend.graph.known import Known, MapPrior, moved_with_map, prior_of
 from calibslam_backend.graph.measured import Motion
 from calibslam_backend.graph.object_graph import T_MAP_FIRST_CAMERA, ObjectGraph
@@ -138,3 +139,20 @@ def test_without_the_quadric_that_others_depend_on() -> None:
     for j in children:
         np.testing.assert_allclose(after[j], before[j], atol=0.1 * np.abs(before[j]).max())
     graph.known().check()
+
+
+def test_a_map_whose_covariances_are_none_of_one_distribution_can_be_gone_on_with(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    def fails(*_: object) -> MapPrior:
+        raise np.linalg.LinAlgError("Singular matrix")
+
+    graph, _ = known_map()
+    graph.add_origin(T_MAP_FIRST_CAMERA)
+    graph.update()
+    monkeypatch.setattr(object_graph, "prior_of", fails)
+    found = graph.known()
+    assert "is not kept: Singular matrix" in caplog.text
+    for j, covariance in graph.quadric_covariances().items():
+        assert found.quadrics[j].parent is None
+        np.testing.assert_allclose(found.with_frame()[j].covariance, covariance)

@@ -180,8 +180,14 @@ class ObjectGraph:
         if not solved:
             return MapPrior(self.frame, new)
         joint = self._smoother.joint([q(j) for j in solved])
-        blocks = np.array([[joint.at(q(i), q(j)) for j in solved] for i in solved])
-        found = prior_of(solved, [self.quadric(j) for j in solved], self.correlation.understated * blocks)
+        blocks = self.correlation.understated * np.array([[joint.at(q(i), q(j)) for j in solved] for i in solved])
+        vectors = [self.quadric(j) for j in solved]
+        try:
+            found = prior_of(solved, vectors, blocks)
+        except np.linalg.LinAlgError as error:  # a map that is too sure is better than none to go on with
+            log.warning("what the quadrics of the map err by together is not kept: %s", error)
+            alone = {j: Known(vectors[n], blocks[n, n]) for n, j in enumerate(solved)}
+            found = MapPrior(np.zeros((6, 6)), alone)
         return MapPrior(self.frame + found.frame, {**found.quadrics, **new})
 
     def joint_covariances(self, k: int, quadrics: list[int]) -> dict[int, Array]:
