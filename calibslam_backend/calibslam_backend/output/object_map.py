@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 from calibslam_backend.geometry.ellipsoid import Ellipsoid
 from calibslam_backend.graph.known import NOTHING_KNOWN, Known, MapPrior
 from calibslam_msgs_py.covariance import LARGEST_VARIANCE, SYMMETRY_TOLERANCE, is_covariance
+from calibslam_msgs_py.files import write_whole
 from calibslam_msgs_py.measurements import SECOND, Array, QuadricEstimate
 
 FORMAT, VERSION = "calibslam-map", 1
@@ -54,13 +55,7 @@ class ObjectMap:
 
     def save(self, path: Path) -> None:
         """Write it as JSON; the same map gives the same bytes. An existing file is replaced in one step."""
-        partial = path.with_name(path.name + ".part")
-        try:
-            partial.write_text(self.to_json(), encoding="utf-8")
-            partial.replace(path)
-        except OSError:
-            partial.unlink(missing_ok=True)
-            raise
+        write_whole(path, self.to_json().encode())
 
     def to_json(self) -> str:
         """As it stands in a file."""

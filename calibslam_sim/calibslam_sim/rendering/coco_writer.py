@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from calibslam_msgs_py.files import write_whole
 from calibslam_msgs_py.measurements import Array
 from calibslam_sim.rendering.render import RenderedImage
 from calibslam_sim.simulation.world import AROUND_TABLE, ON_TABLE, WorldObject
@@ -54,7 +55,7 @@ class CocoWriter:
         number = len(self._images) + 1
         height, width = image.image.shape[:2]
         name = f"{number:06d}.jpg"
-        _write_whole(self._folder / IMAGES / name, image.jpeg())
+        write_whole(self._folder / IMAGES / name, image.jpeg())
         sizes = image.visible_boxes[:, 2:] - image.visible_boxes[:, :2]
         clear = (
             (image.visible_shares >= MIN_VISIBLE)
@@ -93,12 +94,7 @@ class CocoWriter:
             "categories": [{"id": k + 1, "name": name} for k, name in enumerate(CLASSES)],
         }
         # A cut file would tell nobody which images are ours.
-        partial = self._folder / f"{ANNOTATIONS}.part"
-        try:
-            partial.write_text(json.dumps(content), encoding="utf-8")
-            partial.replace(self._folder / ANNOTATIONS)
-        finally:
-            partial.unlink(missing_ok=True)
+        write_whole(self._folder / ANNOTATIONS, json.dumps(content).encode())
         return len(self._images)
 
 
@@ -139,15 +135,6 @@ def _named_by(annotations: Path) -> set[Path]:
         return {annotations} | {annotations.with_name(IMAGES) / image["file_name"] for image in content["images"]}
     except (OSError, ValueError, KeyError, TypeError):
         return set()
-
-
-def _write_whole(file: Path, data: bytes) -> None:
-    """Write a file, or nothing."""
-    try:
-        file.write_bytes(data)
-    except BaseException:
-        file.unlink(missing_ok=True)
-        raise
 
 
 def _coco_box(corners: Array) -> list[float]:
