@@ -1,7 +1,8 @@
-"""Rigid transforms as the user writes them."""
+"""Rigid transforms: as the user writes them, and on the way from one to another."""
 
 from __future__ import annotations
 
+import gtsam
 import numpy as np
 from scipy.spatial.transform import Rotation
 
@@ -26,3 +27,8 @@ def transform_from_text(text: str) -> Array:
     T[:3, :3] = Rotation.from_quat(numbers[3:]).as_matrix()
     T[:3, 3] = numbers[:3]
     return T
+
+
+def on_the_way(start: gtsam.Pose3, end: gtsam.Pose3, share: float) -> gtsam.Pose3:
+    """After this share of the geodesic from start to end."""
+    return start.compose(gtsam.Pose3.Expmap(share * gtsam.Pose3.Logmap(start.between(end))))

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import gtsam
 import numpy as np
 
+from calibslam_backend.geometry.transform import on_the_way
 from calibslam_backend.odometry.failures import FailureFilter
 from calibslam_backend.odometry.motion_noise import MotionNoise
 from calibslam_msgs_py.measurements import SECOND, Array, InvalidMeasurement, RelativeMotion
@@ -271,5 +272,4 @@ class MotionChain:
         if i == len(self._steps) - 1:
             return pose
         before, after = self._steps[i : i + 2]
-        step = gtsam.Pose3.Logmap(pose.between(getattr(after, which)))
-        return pose.compose(gtsam.Pose3.Expmap((time - before.end) / (after.end - before.end) * step))
+        return on_the_way(pose, getattr(after, which), (time - before.end) / (after.end - before.end))

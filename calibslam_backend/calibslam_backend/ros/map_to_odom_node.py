@@ -13,6 +13,7 @@ from typing import Any
 import gtsam
 import numpy as np
 
+from calibslam_backend.geometry.transform import on_the_way
 from calibslam_backend.session.intake import Report
 from calibslam_backend.session.time_guard import TimeGuard
 from calibslam_msgs_py.conversions import RosTypes, odometry_from_msg
@@ -69,8 +70,7 @@ class OdometryHistory:
         if i == 0 or end - self._stamps[i - 1] > self.LARGEST_STEP:
             return None
         start, before, after = self._stamps[i - 1], gtsam.Pose3(self._poses[i - 1]), gtsam.Pose3(self._poses[i])
-        step = gtsam.Pose3.Logmap(before.between(after))
-        return np.asarray(before.compose(gtsam.Pose3.Expmap((stamp - start) / (end - start) * step)).matrix())
+        return np.asarray(on_the_way(before, after, (stamp - start) / (end - start)).matrix())
 
 
 class MapToOdom:
