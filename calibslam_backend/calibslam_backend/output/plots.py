@@ -97,10 +97,10 @@ def _objects(axes: Axes, result: ObjectMap) -> None:
     outline, place = "object", f"{CONFIDENCE:g} sigma of its centre"
     for quadric in result.quadrics:
         R = quadric.T_map_object[:3, :3]
-        shadow = (R * quadric.radii**2) @ R.T  # the outline from above is the ellipse of its upper left block
+        shadow = _from_above(quadric.T_map_object, quadric.radii)
         centre = quadric.T_map_object[:2, 3]
         axes.add_patch(
-            _ellipse(centre, shadow[:2, :2], label=outline, facecolor="tab:purple", alpha=0.25, edgecolor="tab:purple")
+            _ellipse(centre, shadow, label=outline, facecolor="tab:purple", alpha=0.25, edgecolor="tab:purple")
         )
         outline = "_"
         if np.isfinite(quadric.covariance).all():
@@ -109,12 +109,17 @@ def _objects(axes: Axes, result: ObjectMap) -> None:
             place = "_"
 
 
+def _from_above(T: Array, radii: Array) -> Array:
+    """(2, 2) the ellipse that is the outline of an ellipsoid from above: the upper left block of its shape."""
+    return np.asarray((T[:2, :3] * radii**2) @ T[:2, :3].T)
+
+
 def _true_objects(axes: Axes, T_map_world: Array, objects: Sequence[Ellipsoid]) -> None:
     label = "true object"
     for thing in objects:
         T = T_map_world @ thing.T_world_object
-        shadow = (T[:3, :3] * thing.radii**2) @ T[:3, :3].T
-        axes.add_patch(_ellipse(T[:2, 3], shadow[:2, :2], label=label, fill=False, edgecolor="0.4", linewidth=0.7))
+        shadow = _from_above(T, thing.radii)
+        axes.add_patch(_ellipse(T[:2, 3], shadow, label=label, fill=False, edgecolor="0.4", linewidth=0.7))
         label = "_"
 
 
@@ -123,9 +128,9 @@ def _limits(result: ObjectMap, odometry: Array) -> tuple[Array, Array]:
     path = result.poses[:, :2, 3]
     low, high = [odometry[:, :2, 3], path], [odometry[:, :2, 3], path]
     for quadric in result.quadrics:
-        R, centre = quadric.T_map_object[:3, :3], quadric.T_map_object[:2, 3]
+        centre = quadric.T_map_object[:2, 3]
         if np.linalg.norm(path - centre, axis=1).min() < REACH:
-            reach = np.minimum(np.sqrt(np.diag((R * quadric.radii**2) @ R.T))[:2], REACH)
+            reach = np.minimum(np.sqrt(np.diag(_from_above(quadric.T_map_object, quadric.radii))), REACH)
             low.append(centre[None] - reach)
             high.append(centre[None] + reach)
     return np.concatenate(low).min(axis=0) - MARGIN, np.concatenate(high).max(axis=0) + MARGIN
