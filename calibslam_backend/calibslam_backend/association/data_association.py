@@ -64,15 +64,18 @@ class DataAssociation:
     def frame(self, boxes: Boxes, tracks: list[int]) -> Frame:
         """The boxes of an image made ready, with the covariances the noise model gives them."""
         covariances = np.empty((len(boxes), 4, 4))
-        corners = undistorted(boxes.corners, self.camera)
-        for i, track in enumerate(tracks):
-            # Only one model asks, and there may be thousands.
-            is_asked = self.settings.noise_model == QUADRICSLAM
-            before = self._assignments.boxes_of_object(track) if is_asked else []
-            so_far = [*(box.corners for box in before), corners[i]]
+        for i, so_far in enumerate(self._so_far(boxes, tracks)):
             covariances[i] = box_covariance(self.settings, boxes.covariances[i], so_far)
         measurements = prepare(boxes, covariances, self.camera)
         return Frame(measurements, tracks, boxes.class_ids, boxes.object_ids, [None] * len(boxes))
+
+    def _so_far(self, boxes: Boxes, tracks: list[int]) -> list[list[Array]]:
+        """For each box those (4,) of its object that were seen, itself included; none where no noise model asks."""
+        if self.settings.noise_model != QUADRICSLAM:  # there may be thousands
+            return [[] for _ in tracks]
+        now = undistorted(boxes.corners, self.camera)
+        before = [[box.corners for box in self._assignments.boxes_of_object(track)] for track in tracks]
+        return [[*seen, corners] for seen, corners in zip(before, now, strict=True)]
 
     # -- a keyframe ---------------------------------------------------------------------------------------------
 

@@ -47,7 +47,7 @@ def box_covariance(settings: NoiseSettings, own: Array, so_far: Sequence[Array])
     Args:
         settings: the model.
         own: (4, 4) [px^2] that came with it, NaN where unknown.
-        so_far: the boxes (4,) [px] of its object that were seen, this one included.
+        so_far: the boxes (4,) [px] of its object that were seen, this one included; only `quadricslam` looks at them.
     """
     sigma = settings.fixed_sigma
     if settings.noise_model == CALIBRATED and not np.isnan(own[0, 0]):
