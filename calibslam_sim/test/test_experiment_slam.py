@@ -102,6 +102,22 @@ def test_tum_sees_what_the_folder_holds(folder: Path, recording: Simulation) -> 
     assert all(boxes.has_covariance.all() for boxes in found.images)
 
 
+def test_boxes_without_labels_have_the_conditions_that_need_none(folder: Path, tmp_path: Path) -> None:
+    """As those of another detector on the same images, named by `detections`: also when no box has a label."""
+    rows = (folder / "detections.csv").read_text().splitlines()
+    other = tmp_path / "other.csv"
+    other.write_text("".join(row.rsplit(",", 1)[0] + "\n" for row in rows[:1] + rows[2:]))
+    settings = tum.TumSettings(folder=str(folder), detections=str(other))
+    assert len(np.concatenate([boxes.corners for boxes in tum.recorded(settings).images])) == len(rows) - 2
+    assert tum.inputs(settings)[str(other)] == other
+    families = ("real", "backwards", "few", "failing")
+    models = ("calibrated", "fixed", "quadricslam")
+    assert tum.conditions(settings) == [f"{family}_estimated_{model}" for family in families for model in models]
+    assert tum.comparisons(settings) == [
+        (f"{family}_estimated_calibrated", f"{family}_estimated_{model}") for family in families for model in models[1:]
+    ]
+
+
 def test_tum_backwards_undoes_every_motion(folder: Path) -> None:
     forwards = tum.recorded(tum.TumSettings(folder=str(folder)))
     found = forwards.backwards

@@ -19,6 +19,7 @@ With real odometry each repetition leaves out another tenth of the images (`few_
 far a result hangs on single images, not how it would be on other recordings. Two repetitions share nine tenths of their
 images, and a third where there are few: these are nearer to repetitions that know nothing of each other. Two
 `sparse_` ones share two thirds of their objects.
+Boxes without labelled identities (of another detector, `detections`) have the `estimated_` conditions only.
 """
 
 from __future__ import annotations
@@ -95,6 +96,7 @@ class TumSettings(ExperimentSettings):
     """The recording, and how its odometry is made."""
 
     folder: str = setting("", "recording: groundtruth.txt, odometry.txt, detections.csv, camera_info.yaml")
+    detections: str = setting(DETECTIONS, "file in the folder with the boxes")
     calibrator: str = setting("", "file with a calibrator that was fitted on other recordings; empty: the default one")
     good_trajectory: str = setting("reference_orbslam.txt", "file in the folder of which noisy odometry is made")
     rotation_noise: float = setting(0.5, "added to each step of it, about each axis", unit="deg", low=1e-4)
@@ -189,7 +191,7 @@ def recorded(settings: TumSettings) -> TumRecording:
         camera = read_camera(folder / CAMERA_INFO)
         truth = read_trajectory(folder / GROUND_TRUTH)
         calibrate = load_calibrator(settings.calibrator or None)
-        images = read_detections(folder / DETECTIONS, camera)[: settings.most_images]
+        images = read_detections(folder / settings.detections, camera)[: settings.most_images]
         return TumRecording(
             camera,
             Trajectory.of(truth),
@@ -210,13 +212,12 @@ def steps(poses: list[StampedPose]) -> list[RelativeMotion]:
 
 
 def conditions(settings: TumSettings) -> list[str]:
-    """Every noise model in every family, and inflated ones in one.
+    """Every noise model in every family that these boxes allow, and inflated ones in one.
 
     Raises:
         ExperimentError: the folder cannot be used.
     """
-    recorded(settings)  # before any process is started
-    return [prefix + model for prefix in ("", *REAL) for model in _models(prefix)]
+    return [prefix + model for prefix in _families(settings) for model in _models(prefix)]
 
 
 def left_out(settings: TumSettings, condition: str) -> float:
@@ -229,7 +230,7 @@ def left_out(settings: TumSettings, condition: str) -> float:
 
 def inputs(settings: TumSettings) -> dict[str, Path]:
     """The files of the recording, and the calibrator's."""
-    names = (GROUND_TRUTH, ODOMETRY, DETECTIONS, CAMERA_INFO, settings.good_trajectory)
+    names = (GROUND_TRUTH, ODOMETRY, settings.detections, CAMERA_INFO, settings.good_trajectory)
     found = {name: Path(settings.folder) / name for name in names}
     return {**found, "calibrator": Path(settings.calibrator)} if settings.calibrator else found
 
@@ -238,9 +239,19 @@ def comparisons(settings: TumSettings) -> list[tuple[str, str]]:
     """Calibrated against all others of its family."""
     return [
         (prefix + CALIBRATED, prefix + model)
-        for prefix in ("", *REAL)
+        for prefix in _families(settings)
         for model in _models(prefix)
         if model != CALIBRATED
+    ]
+
+
+def _families(settings: TumSettings) -> list[str]:
+    """Prefixes of conditions. Without labels there is no identity to give and no object to leave out."""
+    is_labelled = any(name for boxes in recorded(settings).images for name in boxes.object_ids)
+    return [
+        prefix
+        for prefix in ("", *REAL)
+        if is_labelled or (REAL.get(prefix, GIVEN) == ESTIMATED and not prefix.startswith(SPARSE))
     ]
 
 
