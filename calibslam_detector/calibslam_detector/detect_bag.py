@@ -24,7 +24,7 @@ from calibslam_detector.model.detector import Detector, DetectorSettings, Device
 from calibslam_detector.model.weights_file import SHIPPED, WeightsError
 from calibslam_msgs_py import bags
 from calibslam_msgs_py.bags import BagError, BagReader, BagWriter, refuse_to_replace
-from calibslam_msgs_py.command import ArgumentParser, command
+from calibslam_msgs_py.command import INTERRUPTED, ArgumentParser, command
 from calibslam_msgs_py.conversions import boxes_to_msg, header_to_msg, stamp_from_msg, valid_boxes
 from calibslam_msgs_py.measurements import Boxes, InvalidMeasurement
 from calibslam_msgs_py.settings import Settings, SettingsError, add_arguments, from_arguments, setting
@@ -34,7 +34,6 @@ USUAL_TOPICS = ("/camera/image_raw/compressed", "/camera/image_raw")  # as the n
 OVERLAY = "/detector/overlay/compressed"  # as the node has it
 BOXES = "calibslam_msgs/msg/BoundingBoxArray"
 STRANGE_SHARE = 0.5  # of the images, above which a warning is due
-INTERRUPTED = 130  # exit code, as of a process that SIGINT ended
 
 
 @dataclass(frozen=True)

@@ -26,11 +26,10 @@ from calibslam_detector.model.weights_file import WeightsError
 from calibslam_detector.training.covariance_task import LOSSES, covariance_task, find_examples, stored_examples
 from calibslam_detector.training.detector_task import Processes, detector_task
 from calibslam_detector.training.training_loop import Interrupted, LoopSettings, TrainingError, optimise
-from calibslam_msgs_py.command import ArgumentParser, command
+from calibslam_msgs_py.command import INTERRUPTED, ArgumentParser, command
 from calibslam_msgs_py.settings import Settings, add_arguments, from_arguments, setting
 
 MIN_EXAMPLES = 500  # of the covariance head; a fifth of them are held out, and two sums of f-Cal need 50
-INTERRUPTED = 130  # exit code, as of a process that SIGINT ended
 CHECKPOINT, EXAMPLES = "checkpoint.pt", "examples.pt"
 # What a run may have written that ended before its first checkpoint: nothing that is lost if it begins again.
 BEGUN = {"settings.json", "log.csv", "curves.png", EXAMPLES, f".{EXAMPLES}.part", f".{CHECKPOINT}.part"}

@@ -15,6 +15,8 @@ from typing import Any, ParamSpec
 
 Arguments = ParamSpec("Arguments")
 
+INTERRUPTED = 128 + signal.SIGINT  # exit code
+
 # What to do about errors of the file system.
 MAKE_ROOM = "make room, or choose another path"
 ADVICE = {
@@ -41,9 +43,9 @@ class ArgumentParser(argparse.ArgumentParser):
 
 def command(main: Callable[Arguments, int]) -> Callable[Arguments, int]:
     """A `main` that ends without a word when nobody reads its output any more, as with `| head`, and with one line
-    where a file can be neither read nor written.
+    at Ctrl-C and where a file can be neither read nor written.
 
-    Its exit code is then that of a program ended by SIGPIPE, 141, or 1.
+    Its exit code is then that of a program ended by SIGPIPE, 141, by SIGINT, 130, or 1.
     """
 
     @functools.wraps(main)
@@ -57,6 +59,9 @@ def command(main: Callable[Arguments, int]) -> Callable[Arguments, int]:
             os.dup2(nowhere, sys.stdout.fileno())
             os.close(nowhere)
             return 128 + signal.SIGPIPE
+        except KeyboardInterrupt:
+            print(f"{_name(main)}: interrupted", file=sys.stderr)
+            return INTERRUPTED
         except OSError as error:
             given = next((words for words in arguments if isinstance(words, Sequence)), sys.argv[1:])
             print(f"{_name(main)}: {_told(error, [str(word) for word in given])}", file=sys.stderr)

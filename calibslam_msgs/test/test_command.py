@@ -62,6 +62,15 @@ def test_a_file_in_the_way_is_said(
     assert capsys.readouterr().err.startswith(f"test_command: {told}")
 
 
+def test_an_interrupted_command_says_so(capsys: pytest.CaptureFixture[str]) -> None:
+    @command
+    def main() -> int:
+        raise KeyboardInterrupt
+
+    assert main() == 130
+    assert capsys.readouterr().err == "test_command: interrupted\n"
+
+
 def test_a_program_tells_its_name_and_its_own_arguments(tmp_path: os.PathLike[str]) -> None:
     program = os.path.join(tmp_path, "render.py")
     with open(program, "w") as file:

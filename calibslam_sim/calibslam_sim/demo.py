@@ -226,9 +226,6 @@ def main(argv: Sequence[str] | None = None) -> int:
         say("writing the report")
         report = out / "report.html"
         report.write_text(page(load_runs([out / condition.name for condition in CONDITIONS])), encoding="utf-8")
-    except KeyboardInterrupt:
-        print("demo: interrupted", file=sys.stderr)
-        return 130
     except (ProcessFailed, BagError, ValueError) as error:
         print(f"demo: {error}", file=sys.stderr)
         return 1

@@ -13,7 +13,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from calibslam_msgs_py.command import ArgumentParser, command
+from calibslam_msgs_py.command import INTERRUPTED, ArgumentParser, command
 from calibslam_msgs_py.settings import SettingsError, add_arguments, from_arguments
 from calibslam_sim.experiments.design import Experiment, ExperimentError, ExperimentSettings
 from calibslam_sim.experiments.engine import run
@@ -131,7 +131,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         )
     except KeyboardInterrupt:
         print("experiment: interrupted; the same command goes on where it stopped", file=sys.stderr)
-        return 130
+        return INTERRUPTED
     except (ExperimentError, SettingsError) as error:
         print(f"experiment: {error}", file=sys.stderr)
         return 1

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from calibslam_msgs_py.command import ArgumentParser, command
+from calibslam_msgs_py.command import INTERRUPTED, ArgumentParser, command
 from calibslam_msgs_py.measurements import SECOND
 from calibslam_msgs_py.settings import Settings, add_arguments, from_arguments, setting
 from calibslam_sim.progress import Progress
@@ -25,7 +25,6 @@ from calibslam_sim.simulation.recording import CAMERA
 from calibslam_sim.simulation.world import desk_world
 
 PACES = (0.3, 2.5)  # between a slow and a hasty walk
-INTERRUPTED = 130  # exit code, as of a process that SIGINT ended
 
 
 @dataclass(frozen=True)

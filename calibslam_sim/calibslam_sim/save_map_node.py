@@ -13,7 +13,7 @@ from calibslam_msgs.srv import SaveMap
 from rclpy.signals import SignalHandlerOptions
 from rclpy.utilities import remove_ros_args
 
-from calibslam_msgs_py.command import ArgumentParser
+from calibslam_msgs_py.command import INTERRUPTED, ArgumentParser
 
 
 class SaveError(Exception):
@@ -58,7 +58,7 @@ def main(args: Sequence[str] | None = None) -> int:
         rclpy.init(args=argv, signal_handler_options=SignalHandlerOptions.NO)
         print(save_map(arguments.backend, arguments.path, arguments.timeout))
     except KeyboardInterrupt:
-        return 130  # nothing was saved
+        return INTERRUPTED  # nothing was saved
     except SaveError as error:
         print(f"save_map: {error}", file=sys.stderr)
         return 1

@@ -95,6 +95,8 @@ def items(
             add(boxes.stamp, topics.DETECTIONS_WITHOUT_COVARIANCE, _boxes, boxes)
     else:
         notes.append("no detections.csv: no boxes; run a detector, or name a file with --detections")
+        if class_names is not None:
+            notes.append(f"{class_names} is not used: no boxes, so no numbers of classes")
     if (folder / "rgb.txt").exists():
         for stamp, file in read_image_list(folder / "rgb.txt"):
             image_stamps.add(stamp)

@@ -179,10 +179,11 @@ def test_depth_is_written_in_millimetres(folder: Path, tmp_path: Path) -> None:
 def test_what_a_folder_lacks_is_said(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for name in ("odometry.txt", "groundtruth.txt", "detections.csv"):
         (folder / name).unlink()
-    assert tum_to_bag.main([str(folder), "--out", str(tmp_path / "bag")]) == 0
+    assert tum_to_bag.main([str(folder), "--out", str(tmp_path / "bag"), "--class-names", "coco.names"]) == 0
     said = capsys.readouterr().out
     assert "no odometry.txt" in said
     assert "--detections" in said
+    assert "coco.names is not used" in said
     (folder / "rgb.txt").unlink()
     assert tum_to_bag.main([str(folder), "--out", str(tmp_path / "other")]) == 1
     assert "nothing to convert" in capsys.readouterr().err
