@@ -23,9 +23,10 @@ from calibslam_detector.images.coco_data import BOX_KEYS, CocoData, DataError, l
 from calibslam_detector.model import weights_file
 from calibslam_detector.model.network import ARCHITECTURES, CalibratedDetector
 from calibslam_detector.model.weights_file import WeightsError
+from calibslam_detector.training.checkpoint import TrainingError
 from calibslam_detector.training.covariance_task import LOSSES, covariance_task, find_examples, stored_examples
 from calibslam_detector.training.detector_task import Processes, detector_task
-from calibslam_detector.training.training_loop import Interrupted, LoopSettings, TrainingError, optimise
+from calibslam_detector.training.training_loop import Interrupted, LoopSettings, optimise
 from calibslam_msgs_py.command import INTERRUPTED, ArgumentParser, command
 from calibslam_msgs_py.settings import Settings, add_arguments, from_arguments, setting
 

@@ -24,9 +24,10 @@ from calibslam_detector.model import weights_file
 from calibslam_detector.model.network import CalibratedDetector
 from calibslam_detector.model.region_cues import CUES
 from calibslam_detector.model.weights_file import WeightsError
-from calibslam_detector.training import training_loop
+from calibslam_detector.training import run_log
+from calibslam_detector.training.checkpoint import TrainingError
 from calibslam_detector.training.covariance_task import LOSSES, Examples, covariance_task
-from calibslam_detector.training.training_loop import LoopSettings, Task, TrainingError, batch_of, optimise
+from calibslam_detector.training.training_loop import LoopSettings, Task, batch_of, optimise
 from calibslam_msgs_py.measurements import Boxes
 
 COLOURS = {"cup": (40, 40, 220), "book": (220, 60, 40)}
@@ -245,6 +246,30 @@ def test_a_loss_that_is_not_finite_ends_training_with_the_last_good_state(tmp_pa
         optimise(task, LoopSettings(steps=60), tmp_path, {}, resume=False)
 
 
+def test_steps_with_nothing_to_learn_from_are_told_apart_and_evaluated(tmp_path: Path) -> None:
+    """They are no losses that are not finite, and what they leave as it is can be the best that there is."""
+    module = torch.nn.Linear(1, 1)
+    evaluated: list[float] = []
+
+    def held_out() -> float:
+        evaluated.append(float(module.weight.detach()))
+        return 0.0
+
+    task = Task(
+        module,
+        list(module.parameters()),
+        lambda step: {"loss": module.weight.square().sum()} if step < 3 else None,
+        torch.device("cpu"),
+        "with more boxes",
+        held_out=held_out,
+    )
+    settings = LoopSettings(steps=60, evaluate_every=2, log_every=2)
+    with pytest.raises(TrainingError, match=r"^nothing to learn from in 20 steps up to step 22; begin again with more"):
+        optimise(task, settings, tmp_path, {}, resume=False)
+    assert [row["step"] for row in rows(tmp_path)] == ["0", "2"]
+    assert len(evaluated) == 11  # steps 0, 2 ... 20
+
+
 def test_the_weights_of_the_best_held_out_loss_are_kept(tmp_path: Path) -> None:
     module = torch.nn.Linear(1, 1, bias=False)
     seen = []
@@ -276,7 +301,7 @@ def test_the_weights_of_the_best_held_out_loss_are_kept(tmp_path: Path) -> None:
 def test_without_a_terminal_lines_tell_how_far_it_is(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(training_loop, "SECONDS_BETWEEN_LINES", 0.0)
+    monkeypatch.setattr(run_log, "SECONDS_BETWEEN_LINES", 0.0)
     module = torch.nn.Linear(1, 1)
     task = Task(
         module,

@@ -24,8 +24,9 @@ from calibslam_detector.images.coco_data import CocoData, read_image, to_tensor
 from calibslam_detector.model import weights_file
 from calibslam_detector.model.box_covariance import decoupled
 from calibslam_detector.model.network import CalibratedDetector, Regions
+from calibslam_detector.training.checkpoint import TrainingError
 from calibslam_detector.training.matching import free_of_border, match
-from calibslam_detector.training.training_loop import LoopSettings, Task, TrainingError, batch_of
+from calibslam_detector.training.training_loop import LoopSettings, Task, batch_of
 
 # Each is the likelihood and, with a weight, a demand for calibration (eq. 4.2.6). The weights put both on one scale:
 # the squared Wasserstein distance is in squared units of a sum of K squares, that of Cramer and von Mises is below 1/3.
@@ -162,7 +163,8 @@ def covariance_task(
         head.train()
         return float(sum(found.values()))
 
-    return Task(head, list(head.parameters()), losses, device, held_out=held_out)
+    way_out = "with more --regions (a step has too few boxes of objects wholly in the image), or with --loss nll"
+    return Task(head, list(head.parameters()), losses, device, way_out, held_out=held_out)
 
 
 def _check_whole(whole: Tensor, learnt: int, batch: int, loss: str) -> None:

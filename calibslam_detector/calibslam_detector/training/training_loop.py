@@ -5,11 +5,8 @@ A run folder holds `log.csv` (losses by step), `curves.png`, `checkpoint.pt` and
 
 from __future__ import annotations
 
-import csv
 import math
 import signal
-import sys
-import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -19,19 +16,14 @@ from typing import Any
 import numpy as np
 import torch
 from torch import Tensor, nn
-from tqdm import tqdm
 
-from calibslam_detector.model import weights_file
+from calibslam_detector.training.checkpoint import Best, Checkpoint, TrainingError
 from calibslam_detector.training.curves import plot_curves
+from calibslam_detector.training.run_log import Log, Teller
 from calibslam_msgs_py.settings import Settings, setting
 
 MAX_GRADIENT = 10.0  # norm to which a gradient is cut
 MAX_SKIPPED = 20  # steps without a finite loss in a row
-SECONDS_BETWEEN_LINES = 30.0  # where there is no terminal to show a bar on
-
-
-class TrainingError(RuntimeError):
-    """Training that cannot go on; the text says why and what to do."""
 
 
 class Interrupted(Exception):
@@ -68,6 +60,7 @@ class Task:
         module: whose weights and numbers a checkpoint holds.
         parameters: that are changed.
         losses: names and values at a step; their sum is made smaller. None: nothing to learn from this step.
+        way_out: what to do where steps have nothing to learn from.
         everywhere: whether what is so here is so in all processes, e.g. that a loss is finite.
         is_first: whether this process writes files and shows progress.
         held_out: a loss on samples that are not learnt from. It is told with each line of the log, and in the end the
@@ -78,6 +71,7 @@ class Task:
     parameters: list[nn.Parameter]
     losses: Callable[[int], dict[str, Tensor] | None]
     device: torch.device
+    way_out: str = ""
     everywhere: Callable[[bool], bool] = bool
     is_first: bool = True
     held_out: Callable[[], float] | None = None
@@ -95,64 +89,31 @@ def optimise(task: Task, settings: LoopSettings, folder: Path, identity: dict[st
 
     Raises:
         Interrupted: SIGINT or SIGTERM came; a checkpoint is written.
-        TrainingError: losses are not finite any more, or the checkpoint is of another training.
+        TrainingError: nothing is learnt any more, or the checkpoint is of another training.
     """
-    optimiser = torch.optim.AdamW(task.parameters, settings.learning_rate, weight_decay=settings.weight_decay)
-    amp = settings.amp and task.device.type == "cuda"
-    scaler = torch.amp.GradScaler(task.device.type, enabled=amp)
-    best = Best()
-    parts = {"module": task.module, "optimiser": optimiser, "scaler": scaler, "best": best}
+    descent, best = Descent(task, settings), Best()
+    parts = {"module": task.module, "optimiser": descent.optimiser, "scaler": descent.scaler, "best": best}
     checkpoint = Checkpoint(folder / "checkpoint.pt", identity, parts)
     first = checkpoint.load() if resume else 0
     log = Log(folder / "log.csv", first) if task.is_first else None
-    started, skipped = time.monotonic(), 0
-    told = started
-    with (
-        stop_flag() as stop,
-        tqdm(total=settings.steps, initial=first, unit="step", disable=None if task.is_first else True) as progress,
-    ):
+    with stop_flag() as stop, Teller(first, settings.steps, task.is_first) as tell:
         for step in range(first, settings.steps):
-            for group in optimiser.param_groups:
-                group["lr"] = settings.rate(step)
-            optimiser.zero_grad()
-            with torch.autocast(task.device.type, enabled=amp):
-                losses = task.losses(step)
-                total = sum(losses.values(), torch.zeros((), device=task.device)) if losses is not None else None
-            if total is None or not task.everywhere(bool(torch.isfinite(total))):
-                skipped += 1
-                progress.set_postfix_str(f"{skipped} steps without a finite loss")
-                if skipped >= MAX_SKIPPED:
-                    way_out = f"go on from {checkpoint.path} (--resume)" if checkpoint.path.exists() else "begin again"
-                    raise TrainingError(
-                        f"no finite loss in {MAX_SKIPPED} steps up to step {step}; {way_out} with a smaller "
-                        "--learning-rate"
-                    )
-            else:
-                skipped = 0
-                scaler.scale(total).backward()
-                scaler.unscale_(optimiser)
-                nn.utils.clip_grad_norm_(task.parameters, MAX_GRADIENT)
-                scaler.step(optimiser)
-                scaler.update()
-                is_logged = log is not None and step % settings.log_every == 0
-                is_evaluated = step % settings.evaluate_every == 0
-                held_out = task.held_out() if task.held_out is not None and (is_logged or is_evaluated) else None
-                # What is logged must not decide which weights are kept.
-                if held_out is not None and is_evaluated:
-                    best.offer(held_out, task.module)
-                if is_logged and log is not None and losses is not None:
-                    values = {name: float(value.detach()) for name, value in losses.items()}
-                    if held_out is not None:
-                        values["held_out"] = held_out
-                    log.add(step, time.monotonic() - started, settings.rate(step), values)
-                    progress.set_postfix(loss=f"{float(total.detach()):.4g}")
-                    now = time.monotonic()
-                    if progress.disable and now - told >= SECONDS_BETWEEN_LINES:
-                        told = now
-                        left = (now - started) / (step + 1 - first) * (settings.steps - step - 1)
-                        line = f"step {step + 1} of {settings.steps}: loss {float(total.detach()):.4g}"
-                        print(f"{line}, {left / 60.0:.1f} min left", file=sys.stderr, flush=True)
-            progress.update()
+            try:
+                losses = descent.step(step)
+            except StepsInVain as error:
+                begin = f"go on from {checkpoint.path} (--resume)" if checkpoint.path.exists() else "begin again"
+                raise TrainingError(f"{error.what} up to step {step}; {begin} {error.way_out}") from None
+            is_logged = log is not None and step % settings.log_every == 0
+            is_evaluated = step % settings.evaluate_every == 0
+            held_out = task.held_out() if task.held_out is not None and (is_logged or is_evaluated) else None
+            # What is logged must not decide which weights are kept.
+            if held_out is not None and is_evaluated:
+                best.offer(held_out, task.module)
+            if is_logged and log is not None and losses:
+                values = losses if held_out is None else {**losses, "held_out": held_out}
+                log.add(step, tell.seconds, settings.rate(step), values)
+                tell.loss(step, sum(losses.values()))
+            tell.step(descent.in_vain)
             done = step + 1
             stopped = not task.everywhere(not stop())
             if task.is_first and (stopped or done % settings.checkpoint_every == 0 or done == settings.steps):
@@ -166,111 +127,57 @@ def optimise(task: Task, settings: LoopSettings, folder: Path, identity: dict[st
     best.restore(task.module)
 
 
-class Best:
-    """The weights with the least loss on held-out samples."""
+class StepsInVain(Exception):
+    """So many steps in a row have taught nothing that it makes no sense to go on."""
 
-    def __init__(self) -> None:
-        self._loss, self._weights = math.inf, dict[str, Tensor]()
-
-    def offer(self, loss: float, module: nn.Module) -> None:
-        """Keep a module's weights if they are the best so far."""
-        if loss < self._loss:
-            self._loss = loss
-            self._weights = {name: value.detach().clone() for name, value in module.state_dict().items()}
-
-    def restore(self, module: nn.Module) -> None:
-        """Give a module the best weights; as it is where none were offered."""
-        if self._weights:
-            module.load_state_dict(self._weights)
-
-    def state_dict(self) -> dict[str, Any]:
-        """For a checkpoint."""
-        return {"loss": self._loss, "weights": self._weights}
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """From a checkpoint."""
-        self._loss, self._weights = state["loss"], state["weights"]
+    def __init__(self, what: str, way_out: str) -> None:
+        super().__init__(what)
+        self.what, self.way_out = what, way_out
 
 
-class Checkpoint:
-    """All that decides what the next steps do: the parts, each with state_dict and load_state_dict."""
+class Descent:
+    """Steps of AdamW down a task's losses, with gradients of bounded size.
 
-    def __init__(self, path: Path, identity: dict[str, Any], parts: dict[str, Any]) -> None:
-        self.path = path
-        self._identity = identity
-        self._parts = parts
+    Attributes:
+        in_vain: how many steps in a row have taught nothing.
+    """
 
-    def save(self, step: int) -> None:
-        """Write the state after so many steps."""
-        content = {
-            "step": step,
-            "identity": self._identity,
-            **{name: part.state_dict() for name, part in self._parts.items()},
-            "torch_random": torch.get_rng_state(),
-            "cuda_random": torch.cuda.get_rng_state_all() if torch.cuda.is_available() else [],
-        }
-        weights_file.write_safely(content, self.path)
+    def __init__(self, task: Task, settings: LoopSettings) -> None:
+        self._task, self._settings = task, settings
+        self._amp = settings.amp and task.device.type == "cuda"
+        self.optimiser = torch.optim.AdamW(task.parameters, settings.learning_rate, weight_decay=settings.weight_decay)
+        self.scaler = torch.amp.GradScaler(task.device.type, enabled=self._amp)
+        self.in_vain = 0
 
-    def load(self) -> int:
-        """Take the state of the file up; returns the number of steps done.
+    def step(self, number: int) -> dict[str, float]:
+        """Losses by name; none if the step has taught nothing.
 
         Raises:
-            TrainingError: there is none, or it is of another training.
+            StepsInVain: `MAX_SKIPPED` of them in a row.
         """
-        try:
-            content = weights_file.read(self.path, "checkpoint")
-            identity = content["identity"]
-            for name, value in self._identity.items():
-                if identity.get(name) != value:
-                    raise TrainingError(
-                        f"{self.path} is of a training with {name} = {identity.get(name)!r}, not {value!r}; "
-                        "go on with the same options, or begin in another folder"
-                    )
-            for name, part in self._parts.items():
-                part.load_state_dict(content[name])
-            torch.set_rng_state(content["torch_random"])
-            if torch.cuda.is_available() and len(content["cuda_random"]) == torch.cuda.device_count():
-                torch.cuda.set_rng_state_all(content["cuda_random"])
-            return int(content["step"])
-        except (weights_file.WeightsError, KeyError, RuntimeError) as error:
-            if isinstance(error, TrainingError):
-                raise
-            raise TrainingError(f"cannot resume: {error}") from None
+        for group in self.optimiser.param_groups:
+            group["lr"] = self._settings.rate(number)
+        self.optimiser.zero_grad()
+        with torch.autocast(self._task.device.type, enabled=self._amp):
+            losses = self._task.losses(number)
+            total = sum((losses or {}).values(), torch.zeros((), device=self._task.device))
+        if losses is None:
+            return self._skip("nothing to learn from", self._task.way_out)
+        if not self._task.everywhere(bool(torch.isfinite(total))):
+            return self._skip("no finite loss", "with a smaller --learning-rate")
+        self.in_vain = 0
+        self.scaler.scale(total).backward()
+        self.scaler.unscale_(self.optimiser)
+        nn.utils.clip_grad_norm_(self._task.parameters, MAX_GRADIENT)
+        self.scaler.step(self.optimiser)
+        self.scaler.update()
+        return {name: float(value.detach()) for name, value in losses.items()}
 
-
-class Log:
-    """Losses by step in a CSV file; what comes after the step of a resumed checkpoint is dropped."""
-
-    def __init__(self, path: Path, first: int) -> None:
-        self.path = path
-        self._names: list[str] = []
-        self._rows: list[dict[str, str]] = []
-        if first and path.exists():
-            with path.open(newline="") as file:
-                self._rows = [row for row in csv.DictReader(file) if int(row["step"]) < first]
-        self._names = list(self._rows[0]) if self._rows else []
-        self._begun_at = float(self._rows[-1]["seconds"]) if self._rows else 0.0
-        if self._names:
-            self._write("w", self._rows)
-        else:
-            path.unlink(missing_ok=True)
-
-    def add(self, step: int, seconds: float, rate: float, losses: dict[str, float]) -> None:
-        """A line; `seconds` since this process began."""
-        row = {"step": str(step), "seconds": f"{self._begun_at + seconds:.1f}", "learning_rate": f"{rate:.6g}"}
-        row.update({name: f"{value:.6g}" for name, value in losses.items()})
-        if not self._names:
-            self._names = list(row)
-            self._write("w", [row])
-        else:
-            self._write("a", [row])
-
-    def _write(self, mode: str, rows: list[dict[str, str]]) -> None:
-        with self.path.open(mode, newline="") as file:
-            writer = csv.DictWriter(file, self._names)
-            if mode == "w":
-                writer.writeheader()
-            writer.writerows(rows)
+    def _skip(self, what: str, way_out: str) -> dict[str, float]:
+        self.in_vain += 1
+        if self.in_vain >= MAX_SKIPPED:
+            raise StepsInVain(f"{what} in {self.in_vain} steps", way_out)
+        return {}
 
 
 @contextmanager
