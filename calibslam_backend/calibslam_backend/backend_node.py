@@ -184,11 +184,10 @@ class BackendNode(Node):
         """As soon as there is a new one; the map has time."""
         session = self._session
         with session.lock:
-            estimator = session.estimator
-            if estimator is None or not estimator.stamps:
+            if not session.is_located:
                 self._map_to_odom.pose = None  # until the camera is found in the map
-                return
-            if not session.pose_is_new:
+            estimator = session.estimator
+            if estimator is None or not estimator.stamps or not session.pose_is_new:
                 return
             session.pose_is_new = False
             self._outputs[POSE].publish(pose_message(estimator, self._types, self._settings.map_frame))

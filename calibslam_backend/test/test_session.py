@@ -383,6 +383,28 @@ def test_a_trajectory_that_is_too_long_is_followed_by_another_one() -> None:
     assert steps.max() < 0.3
 
 
+def test_where_the_body_is_stays_known_when_a_trajectory_has_become_too_long() -> None:
+    """And only then: map -> odom is published meanwhile."""
+    session, ended = live(settings=LIMITED), 0
+    assert not session.is_located
+    for measurement in THERE_AND_BACK.measurements():
+        session.use([measurement])
+        assert session.estimator is not None
+        if not session.estimator.stamps and session.counts["trajectories_ended"]:
+            assert session.is_located
+            ended += 1
+    assert ended
+    session.use([StampedPose(0, session.trajectory()[-1])])
+    assert not session.is_located
+    session = live(settings=LIMITED).use(list(THERE_AND_BACK.measurements()))
+    assert session.estimator is not None and session.is_located
+    session.load(session.estimator.object_map())
+    assert not session.is_located
+    session = live(settings=LIMITED).use(list(THERE_AND_BACK.measurements()))
+    session.reset()
+    assert not session.is_located
+
+
 def test_a_trajectory_that_is_too_long_without_any_object() -> None:
     """There is no map in which it could go on: it begins anew at the origin, and images go on being used."""
     seeing_nothing = [

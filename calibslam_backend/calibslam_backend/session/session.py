@@ -63,6 +63,7 @@ class Session:
         self.tally = Tally(report)
         self._used = 0.0
         self.refined, self.pose_is_new, self.map_is_new = True, False, False
+        self._goes_on = False  # where the trajectory before ended
         self.resumed = 0.0 if journal is not None and journal.found else 1.0
         if self.resumed < 1.0:
             self.intake.write(Event(Kind.RESUMED))
@@ -86,6 +87,12 @@ class Session:
                 "camera_changed", "camera_info changed; the first one stays in use until ~/reset is called"
             )
         return known is not None
+
+    @property
+    def is_located(self) -> bool:
+        """Whether something is known of where the body is in the map: from the first keyframe on, and before it where
+        the trajectory goes on from one that had become too long."""
+        return self.estimator is not None and (bool(self.estimator.stamps) or self._goes_on)
 
     @property
     def camera(self) -> Camera | None:
@@ -179,8 +186,7 @@ class Session:
             self._begin(lambda: estimator.start_at(T))
             self._guard.reset()
         elif isinstance(content, ObjectMap):
-            self.estimator.load(content)
-            self._guard.reset()
+            self._load(content)
         elif event.kind == Kind.REFINED:
             self.estimator.finish()
             self.refined = self.pose_is_new = self.map_is_new = True
@@ -222,6 +228,7 @@ class Session:
         self._report.say(f"{len(estimator.stamps)} keyframes (max_keyframes): a new trajectory begins in the map")
         if estimator.objects:
             self._begin(lambda: estimator.start_at(estimator.body_pose(), self.SINCE_KEYFRAME))
+            self._goes_on = True
         else:
             self._begin(lambda: estimator.begin_again(keep_map=False))
         gc.collect()  # a graph is in reference cycles
@@ -231,7 +238,14 @@ class Session:
         assert self.estimator is not None
         waiting = self.estimator.waiting
         begin()
+        self._goes_on = False
         self._left_out(waiting - self.estimator.waiting)
+
+    def _load(self, known: ObjectMap) -> None:
+        assert self.estimator is not None
+        self.estimator.load(known)
+        self._goes_on = False
+        self._guard.reset()
 
     def _left_out(self, images: int) -> None:
         if images:
@@ -242,6 +256,7 @@ class Session:
         self._camera = event
         self._frames = {Boxes: event.content.frame_id} if event.content.frame_id else {}
         self.estimator = Estimator(event.content, self._T_body_camera, self._estimator_settings)
+        self._goes_on = False
         self._guard.reset()
 
     def _refine(self) -> None:
@@ -279,10 +294,8 @@ class Session:
         """
         self.check_ready()
         with self.lock:
-            assert self.estimator is not None
             loaded = Event(Kind.MAP, known, known.to_json().encode())
-            self.estimator.load(known)
-            self._guard.reset()
+            self._load(known)
             self.refined = True
             try:
                 self.intake.begin_again([self._camera, loaded], keep_queue=True)
