@@ -38,7 +38,7 @@ from calibslam_backend.objects.new_quadrics import NewQuadrics
 from calibslam_backend.objects.upkeep import Upkeep
 from calibslam_backend.odometry.motion_chain import MotionChain
 from calibslam_backend.odometry.waiting_images import WaitingImages
-from calibslam_backend.output.object_map import ObjectMap
+from calibslam_backend.output.object_map import MotionCovariances, ObjectMap
 from calibslam_msgs_py.measurements import (
     SECOND,
     Array,
@@ -58,6 +58,8 @@ class Estimator:
     SETTLE_EVERY = 2  # keyframes
     # At the end: rounds of association and optimisation, and when poses [rad, m] count as settled.
     ROUNDS, ITERATIONS_OF_A_ROUND, ITERATIONS, CONVERGED = 5, 2, 10, 5e-3
+
+    SPANS, MOTIONS = (1, 3, 10, 30), 100  # keyframes that motions span whose covariances are told, and how many of each
 
     def __init__(self, camera: Camera, T_body_camera: Array, settings: EstimatorSettings) -> None:
         load_kernels()
@@ -164,6 +166,19 @@ class Estimator:
     def pose_covariance(self, index: int) -> Array:
         """(6, 6) [rotation, translation] of a keyframe in its camera frame."""
         return self._graph.pose_covariance(index)
+
+    def motion_covariances(self) -> MotionCovariances:
+        """Of motions over as many keyframes as `SPANS` says, of each at most `MOTIONS` that are evenly spread."""
+        count = len(self.stamps)
+        pairs = [
+            (first, first + span)
+            for span in self.SPANS
+            if span < count
+            for first in np.unique(np.linspace(0, count - span - 1, self.MOTIONS).astype(int)).tolist()
+        ]
+        first, last = np.array(pairs, dtype=int).reshape(-1, 2).T
+        covariances = [self._graph.motion_covariance(*pair) for pair in pairs]
+        return MotionCovariances(first, last, np.reshape(covariances, (-1, 6, 6)))
 
     def object_map(self) -> ObjectMap:
         """Everything that is estimated, with covariances."""

@@ -189,6 +189,7 @@ def run_record(
     }
     return RunRecord(
         odometry=estimator.odometry(),
+        motions=estimator.motion_covariances(),
         online=Trajectory(
             np.array([keyframe.stamp for keyframe in keyframes]),
             np.reshape([keyframe.T_map_camera for keyframe in keyframes], (-1, 4, 4)),

@@ -14,9 +14,11 @@ from calibslam_backend.output.metrics import (
     ate,
     interpolated,
     keyframes_with_truth,
+    motion_nees,
     position_nees,
     rpe,
 )
+from calibslam_backend.output.object_map import MotionCovariances
 from calibslam_msgs_py.measurements import Array
 
 SECOND = 1_000_000_000
@@ -169,6 +171,30 @@ def test_nees_of_honest_covariances_is_three() -> None:
     estimate.poses[1:, :3, 3] += rng.multivariate_normal(np.zeros(3), A @ A.T, size=2000)
     nees = position_nees(estimate, np.tile(covariance, (2001, 1, 1)), truth)
     assert nees == pytest.approx(3.0, abs=0.2)
+
+
+def test_nees_of_motions_by_hand() -> None:
+    """Steps of 1 m are 1.1, 1.0 and 0.8 m long in the estimate, sigmas 0.1: (1 + 0 + 4) / 3 and, of two, 1 and 4."""
+    truth = moved(at((0, 0, 0), (1, 0, 0), (2, 0, 0), (3, 0, 0)), MOVE)
+    estimate = at((0, 0, 0), (1.1, 0, 0), (2.1, 0, 0), (2.9, 0, 0))
+    motions = MotionCovariances(
+        np.array([0, 1, 2, 0, 1]), np.array([1, 2, 3, 2, 3]), np.tile(0.01 * np.eye(6), (5, 1, 1))
+    )
+    assert motion_nees(estimate, motions, truth) == pytest.approx({1: 5.0 / 3.0, 2: 2.5})
+    # What all have in common is no error of a motion, and rotations do not count.
+    motions.covariances[:, :3, :3] *= 100.0
+    assert motion_nees(moved(estimate, MOVE), motions, truth) == pytest.approx({1: 5.0 / 3.0, 2: 2.5})
+    # The covariance is in the body at the end: sigma 0.2 along its own y, which is the map's x.
+    estimate.poses[:, :3, :3] = truth.poses[:, :3, :3] = gtsam.Rot3.Yaw(-np.pi / 2).matrix()
+    truth.poses[:, :3, 3] = at((0, 0, 0), (1, 0, 0), (2, 0, 0), (3, 0, 0)).poses[:, :3, 3]
+    motions.covariances[:, 4, 4] = 0.04
+    assert motion_nees(estimate, motions, truth) == pytest.approx({1: 5.0 / 12.0, 2: 0.625})
+    # Without truth at the last pose, two motions are left.
+    short = Trajectory(truth.stamps[:3], truth.poses[:3])
+    late = Trajectory(estimate.stamps + np.array([0, 0, 0, SECOND]), estimate.poses)
+    assert motion_nees(late, motions, short) == pytest.approx({1: 0.125, 2: 0.25})
+    none = MotionCovariances(np.zeros(0, int), np.zeros(0, int), np.zeros((0, 6, 6)))
+    assert motion_nees(estimate, none, truth) == {}
 
 
 def test_association_scores_by_hand() -> None:

@@ -62,6 +62,23 @@ def test_covariances_are_carried_along_a_motion() -> None:
     assert np.abs(before - expected).max() > 0.1 * np.abs(expected).max()
 
 
+def test_motions_are_as_uncertain_as_odometry_where_nothing_else_is_known() -> None:
+    """Two steps add up in the body at the end; where the first pose is takes no part in it."""
+    load_kernels()
+    settings = EstimatorSettings()
+    graph = ObjectGraph(CAMERA.K, settings, settings, settings)
+    graph.add_origin()
+    steps = [motion(TURN, 0.01), motion(np.linalg.inv(TURN) @ TURN @ TURN, 0.03)]
+    for step in steps:
+        graph.add_pose(step, graph.predict(step))
+    graph.update()
+    np.testing.assert_allclose(graph.motion_covariance(0, 1), steps[0].covariance, rtol=1e-6, atol=1e-9)
+    np.testing.assert_allclose(graph.motion_covariance(1, 2), steps[1].covariance, rtol=1e-6, atol=1e-9)
+    undone = gtsam.Pose3(steps[1].T).inverse().AdjointMap()
+    expected = undone @ steps[0].covariance @ undone.T + steps[1].covariance
+    np.testing.assert_allclose(graph.motion_covariance(0, 2), expected, rtol=1e-6, atol=1e-9)
+
+
 def test_what_an_iteration_moves_is_linearised_anew() -> None:
     """The solution of an iteration is not where its factors were linearised."""
     graph = graph_of_one_quadric(off=0.2)

@@ -213,7 +213,7 @@ def without_covariance(message: Any) -> Any:
 def test_without_ground_truth_there_is_no_error_to_state(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     write(tmp_path / "bag", [m for m in messages() if m[0] != "/ground_truth"])
     metrics = run(tmp_path / "bag", tmp_path / "run")
-    assert metrics["ate_m"] is None and metrics["nees_position"] is None
+    assert metrics["ate_m"] is None and metrics["nees_position"] is None and metrics["nees_motion"] is None
     assert metrics["keyframes_with_truth"] == 0
     assert "no ATE: no ground truth\n" in capsys.readouterr().out
 

@@ -5,7 +5,8 @@ Association given, everything else as it is by default. What the benchmark measu
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections import defaultdict
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
@@ -21,29 +22,47 @@ from calibslam_sim.simulation.recording import SCENARIOS, SimulationSettings, si
 SEEDS = 25
 DESK = SimulationSettings(duration=20.0, frame_rate=10.0)
 SCALES = (1.0, 0.5, 2.0)  # factors on the standard deviations of boxes
-Found = tuple[dict[float, list[float]], list[float]]
+SPANS = (1, 3, 10)  # keyframes
+
+
+@dataclass
+class Found:
+    """For each scale NEES of the last position of each run, and of its motions by span; NEES of quadrics at scale 1."""
+
+    positions: dict[float, list[float]]
+    motions: dict[tuple[float, int], list[float]]
+    quadrics: list[float]
 
 
 @pytest.fixture(scope="module")
 def found() -> Found:
-    """For each scale NEES of the last position of each run; for the right one that of each quadric."""
-    positions: dict[float, list[float]] = {scale: [] for scale in SCALES}
-    quadrics: list[float] = []
+    found = Found(defaultdict(list), defaultdict(list), [])
     for seed in range(SEEDS):
         recording = simulate(replace(DESK, seed=seed))
         for scale in SCALES:
             done = run(recording, EstimatorSettings(association=GIVEN, covariance_scale=scale))
-            positions[scale].append(position_nees_at_the_end(done))
-            quadrics += quadric_nees(done) if scale == 1.0 else []
-    return positions, quadrics
+            found.positions[scale].append(position_nees_at_the_end(done))
+            for span, nees in done.motion_nees().items():
+                found.motions[scale, span].append(nees)
+            found.quadrics += quadric_nees(done) if scale == 1.0 else []
+    return found
+
+
+@pytest.mark.parametrize("span", SPANS)
+def test_motions_are_as_uncertain_as_they_say(found: Found, span: int) -> None:
+    """Each run's mean over its motions is a sample: with the true covariances their mean over runs is 3 (t-test, not
+    refused at 5 %), with half of the deviations it is more, with twice it is less (one-sided, 0.1 %)."""
+    honest, overconfident, underconfident = (found.motions[scale, span] for scale in SCALES)
+    assert stats.ttest_1samp(honest, 3.0).pvalue > 0.05, np.mean(honest)
+    assert stats.ttest_1samp(overconfident, 3.0, alternative="greater").pvalue < 1e-3, np.mean(overconfident)
+    assert stats.ttest_1samp(underconfident, 3.0, alternative="less").pvalue < 1e-3, np.mean(underconfident)
 
 
 def test_positions_are_as_uncertain_as_they_say(found: Found) -> None:
     """The sum over 25 runs of one squared error each is chi-squared with 75 degrees of freedom: their mean lies within
     the 95 % interval with the true covariances of boxes, and above with half of the deviations."""
-    positions, _ = found
     low, high = nees_interval(3, SEEDS)
-    assert low < np.mean(positions[1.0]) < high < np.mean(positions[0.5])
+    assert low < np.mean(found.positions[1.0]) < high < np.mean(found.positions[0.5])
 
 
 def test_positions_are_surer_than_underconfident_boxes_say(found: Found) -> None:
@@ -52,8 +71,7 @@ def test_positions_are_surer_than_underconfident_boxes_say(found: Found) -> None
     Odometry, whose covariance is right, keeps the mean from falling far: to see it below the interval takes the 50
     seeds of the benchmark.
     """
-    positions, _ = found
-    comparison = paired(positions[2.0], positions[1.0])
+    comparison = paired(found.positions[2.0], found.positions[1.0])
     assert comparison["mean_difference"] < 0.0 and comparison["p_value"] < 0.02, comparison
 
 
@@ -63,7 +81,7 @@ def test_centres_and_shapes_are_near_their_covariances(found: Found) -> None:
     Not 90 %: the prior on proportions is narrower than the proportions of flat things differ, and shapes of which few
     boxes tell are no Gaussians. The benchmark measures the share.
     """
-    covered = np.mean(np.array(found[1]) < stats.chi2.ppf(0.9, 9))
+    covered = np.mean(np.array(found.quadrics) < stats.chi2.ppf(0.9, 9))
     assert 0.7 < covered < 0.95
 
 

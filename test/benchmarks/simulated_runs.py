@@ -15,7 +15,7 @@ from calibslam_backend.estimator import Estimator, EstimatorSettings
 from calibslam_backend.geometry.ellipsoid import Ellipsoid
 from calibslam_backend.graph.object_graph import T_MAP_FIRST_CAMERA
 from calibslam_backend.keyframe import Keyframe
-from calibslam_backend.output.metrics import Trajectory, ate
+from calibslam_backend.output.metrics import Trajectory, ate, motion_nees
 from calibslam_msgs_py.measurements import Array, Boxes, RelativeMotion
 from calibslam_sim.simulation.recording import Simulation
 
@@ -30,8 +30,16 @@ class Run:
 
     def ate(self) -> float:
         """[m], final."""
+        return ate(*self._trajectories())
+
+    def motion_nees(self) -> dict[int, float]:
+        """Mean NEES of motions by how many keyframes they span; 3 is honest."""
+        estimated, truth = self._trajectories()
+        return motion_nees(estimated, self.estimator.motion_covariances(), truth)
+
+    def _trajectories(self) -> tuple[Trajectory, Trajectory]:
         estimated = Trajectory(np.array(self.estimator.stamps), self.estimator.trajectory())
-        return ate(estimated, Trajectory(self.recording.times, self.recording.T_world_camera))
+        return estimated, Trajectory(self.recording.times, self.recording.T_world_camera)
 
 
 def measurements(recording: Simulation) -> Iterator[Boxes | RelativeMotion]:

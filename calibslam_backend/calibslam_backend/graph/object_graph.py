@@ -157,6 +157,17 @@ class ObjectGraph:
         own = self.correlation.understated * self._smoother.marginal(x(k))
         return np.asarray(own + by_frame @ self.frame @ by_frame.T)
 
+    def motion_covariance(self, first: int, last: int) -> Array:
+        """(6, 6) [rotation, translation] of the motion between two keyframes, in the body at its end; the tree's own.
+
+        What is not known of the whole map takes no part in it.
+        """
+        joint = self._smoother.joint([x(first), x(last)])
+        both = np.block([[joint.at(a, b) for b in (x(first), x(last))] for a in (x(first), x(last))])
+        undone = gtsam.Pose3(self.pose(last)).between(gtsam.Pose3(self.pose(first)))
+        A = np.hstack([-undone.AdjointMap(), np.eye(6)])
+        return np.asarray(A @ both @ A.T)
+
     def distance(self, k: int, T_map_camera: Array) -> float:
         """Mahalanobis distance of keyframe k from where it is estimated to be, if it were at this pose (4, 4); by the
         tree's own covariance, as all gates."""

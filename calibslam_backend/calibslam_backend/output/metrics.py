@@ -13,6 +13,7 @@ from evo.core.geometry import GeometryException
 from evo.core.trajectory import PoseTrajectory3D
 from scipy.spatial.transform import Rotation, Slerp
 
+from calibslam_backend.output.object_map import MotionCovariances
 from calibslam_msgs_py.measurements import Array, StampedPose
 
 MAX_STAMP_DIFFERENCE = 0.02  # [s] between a keyframe and its ground truth
@@ -158,6 +159,33 @@ def position_nees(estimate: Trajectory, covariances: Array, truth: Trajectory) -
     in_map = R @ covariances[:, 3:, 3:] @ R.transpose(0, 2, 1)
     squared = np.einsum("ni,ni->n", errors[1:], np.linalg.solve(in_map[1:], errors[1:, :, None])[:, :, 0])
     return float(squared.mean())
+
+
+def motion_nees(estimate: Trajectory, motions: MotionCovariances, truth: Trajectory) -> dict[int, float]:
+    """Mean normalised squared error of the translation of motions, by how many keyframes they span; 3 if covariances
+    are right, more if overconfident.
+
+    The positions of one recording have the error of its beginning in common, so that their NEES is hardly more than
+    one sample. Motions in different parts of it have little in common.
+
+    Args:
+        estimate: N poses in the map.
+        motions: between them.
+        truth: in any frame; motions whose ends it does not cover do not count.
+    """
+    covered, found = interpolated(truth, estimate.stamps)
+    true = np.full((len(estimate.stamps), 4, 4), np.nan)
+    true[covered] = found
+    spans = motions.last - motions.first
+    counts = covered[motions.first] & covered[motions.last]
+    first, last = motions.first[counts], motions.last[counts]
+    estimated = np.linalg.inv(estimate.poses[first]) @ estimate.poses[last]
+    truly = np.linalg.inv(true[first]) @ true[last]
+    # In the frame of the last pose, as the covariances are.
+    errors = np.einsum("nji,nj->ni", estimated[:, :3, :3], (estimated - truly)[:, :3, 3])
+    covariances = motions.covariances[counts][:, 3:, 3:]
+    squared = np.einsum("ni,ni->n", errors, np.linalg.solve(covariances, errors[:, :, None])[:, :, 0])
+    return {int(n): float(squared[spans[counts] == n].mean()) for n in np.unique(spans[counts])}
 
 
 @dataclass(frozen=True)

@@ -33,6 +33,20 @@ class MapFileError(ValueError):
 
 
 @dataclass(frozen=True)
+class MotionCovariances:
+    """How well motions between keyframes are known, which the covariances of their poses alone do not tell.
+
+    Attributes:
+        first, last: (M,) indices of the keyframes.
+        covariances: (M, 6, 6) [rotation, translation], in the camera frame of the last.
+    """
+
+    first: Array
+    last: Array
+    covariances: Array
+
+
+@dataclass(frozen=True)
 class ObjectMap:
     """Objects and trajectory.
 

@@ -18,10 +18,11 @@ from calibslam_backend.output.metrics import (
     association_scores,
     ate,
     keyframes_with_truth,
+    motion_nees,
     position_nees,
     rpe,
 )
-from calibslam_backend.output.object_map import ObjectMap, tum_lines
+from calibslam_backend.output.object_map import MotionCovariances, ObjectMap, tum_lines
 from calibslam_backend.output.plots import plot_run
 from calibslam_msgs_py.measurements import Array
 
@@ -32,6 +33,7 @@ class RunRecord:
 
     Attributes:
         odometry: poses (N, 4, 4) of the keyframes by odometry alone, and covariances (N, 6, 6).
+        motions: what is known of those between keyframes.
         online: each keyframe as known right after it; without those in which the estimator failed.
         seconds: each keyframe's update.
         between: the longest that an image since the keyframe before took.
@@ -49,6 +51,7 @@ class RunRecord:
     """
 
     odometry: tuple[Array, Array]
+    motions: MotionCovariances
     online: Trajectory
     seconds: Array
     between: Array
@@ -80,6 +83,16 @@ def accuracy(
         if absolute is None or truth is None
         else position_nees(estimate, covariances, truth),
     }
+
+
+def honesty_of_motions(
+    result: ObjectMap, motions: MotionCovariances, truth: Trajectory | None
+) -> dict[str, float] | None:
+    """NEES of motions by how many keyframes they span, as an entry of metrics.json; None without ground truth."""
+    if truth is None:
+        return None
+    found = motion_nees(Trajectory(np.array(result.stamps), result.poses), motions, truth)
+    return {str(span): nees for span, nees in found.items()} or None
 
 
 def _error(
@@ -117,6 +130,7 @@ def metrics_of(result: ObjectMap, record: RunRecord, truth: Trajectory | None) -
     scores = association_scores(record.associations)
     return {
         **accuracy(result.stamps, result.poses, result.covariances, truth),
+        "nees_motion": honesty_of_motions(result, record.motions, truth),
         **accuracy(result.stamps, *record.odometry, truth, "odometry_"),
         "online_ate_m": _error(ate, record.online, truth),
         "keyframes": len(result.stamps),

@@ -19,7 +19,6 @@ from calibslam_backend.estimator import EstimatorSettings
 from calibslam_backend.graph.noise import CALIBRATED as OWN_COVARIANCE
 from calibslam_backend.graph.noise import FIXED, QUADRICSLAM
 from calibslam_backend.output.metrics import Trajectory, alignment
-from calibslam_backend.output.object_map import ObjectMap
 from calibslam_msgs_py.settings import setting
 from calibslam_sim.accuracy.objects import MapObject, map_objects, object_accuracy
 from calibslam_sim.experiments.design import (
@@ -33,7 +32,7 @@ from calibslam_sim.experiments.design import (
     Seed,
 )
 from calibslam_sim.experiments.figures import condition_figure
-from calibslam_sim.experiments.object_slam import accuracy_of_trajectory, estimate
+from calibslam_sim.experiments.object_slam import HONESTY, Estimate, accuracy_of_trajectory, estimate
 from calibslam_sim.simulation.recording import Simulation, SimulationSettings, simulate
 
 OUTLIERS = "outliers_"  # conditions in which some boxes are grossly wrong
@@ -81,12 +80,12 @@ def recorded(settings: SimulationSettings) -> Simulation:
     return simulate(settings)
 
 
-def accuracy(result: ObjectMap, recording: Simulation) -> Metrics:
+def accuracy(result: Estimate, recording: Simulation) -> Metrics:
     """Metrics of an estimate against the truth."""
     truth = Trajectory(recording.times, recording.T_world_camera)
-    T_world_map = alignment(Trajectory(np.array(result.stamps), result.poses), truth)
+    T_world_map = alignment(Trajectory(np.array(result.map.stamps), result.map.poses), truth)
     objects = object_accuracy(
-        map_objects(result.quadrics, T_world_map),
+        map_objects(result.map.quadrics, T_world_map),
         [MapObject(thing.class_id, thing.ellipsoid) for thing in recording.world],
     )
     return {
@@ -120,7 +119,7 @@ METRICS = {
     "iou_error": Metric("1 - IoU in 3-D"),
     "missed": Metric("missed objects"),
     "spurious": Metric("objects that are none"),
-    "nees_position": Metric("NEES (3 is honest)", is_error=False),
+    **HONESTY,
 }
 
 EXPERIMENT = Experiment(

@@ -54,7 +54,7 @@ from calibslam_sim.experiments.design import (
     scale_name,
 )
 from calibslam_sim.experiments.figures import condition_figure
-from calibslam_sim.experiments.object_slam import accuracy_of_trajectory, estimate
+from calibslam_sim.experiments.object_slam import HONESTY, accuracy_of_trajectory, estimate
 from calibslam_sim.simulation.failing_odometry import OdometryFailures
 from calibslam_sim.simulation.odometry_noise import OdometryNoise
 from calibslam_sim.tum_folder import TumError, read_camera, read_detections, read_trajectory
@@ -290,7 +290,7 @@ TABLES: dict[tuple[str, str], DocumentNumbers] = {
 METRICS = {
     "ate_m": Metric("ATE", "m"),
     "rpe_m": Metric("RPE", "m"),
-    "nees_position": Metric("NEES (3 is honest)", is_error=False),
+    **HONESTY,
 }
 
 EXPERIMENT = Experiment(
