@@ -47,8 +47,9 @@ def block(result: dict[str, Any], experiment: Experiment) -> str:
     shown = [metric for metric in metrics if metric in next(iter(result["conditions"].values()))]
     for condition, theirs in experiment.document(result["settings"]).items():
         cells = [mean_and_deviation(*theirs[metric]) if metric in theirs else "" for metric in shown]
-        at = [row[0] for row in rows].index(condition) + 1
-        rows.insert(at, [f"*{condition}, the document*", *cells])
+        names = [row[0] for row in rows]
+        if condition in names:  # not where boxes are those of another detector, without identities
+            rows.insert(names.index(condition) + 1, [f"*{condition}, the document*", *cells])
     parts = [f"```bash\n{result['command']}\n```", _markdown(rows)]
     tests = rows_of_pairs(result, metrics)
     if len(tests) > 1:

@@ -40,6 +40,16 @@ def test_tables_show_ours_and_the_documents_numbers() -> None:
     assert "1.5 minutes of computing, code 0.1.0+3f2a90c1d4e5." in lines[-1]
 
 
+def test_the_documents_numbers_stand_only_below_conditions_that_there_are() -> None:
+    found = result()
+    del found["conditions"]["calibrated"]
+    lines = results.block(found, load("toy")).splitlines()
+    assert [line.split(" | ")[0] for line in lines if ", the document" in line] == [
+        "| *overconfident, the document*",
+        "| *underconfident, the document*",
+    ]
+
+
 def test_fill_replaces_what_stands_between_the_marks() -> None:
     text = "a\n<!-- results toy -->\nold\n<!-- end toy -->\nb <!-- results kalman --><!-- end kalman -->\n"
     filled = results.fill(text, "toy", "new")
