@@ -26,7 +26,6 @@ KEYS = {
     "pytest": "python3-pytest",
     "scipy": "python3-scipy",
     "sklearn": "python3-sklearn",
-    "tqdm": "python3-tqdm",
     "yaml": "python3-yaml",
 }
 WITHOUT_KEY = {"evo", "gtsam", "plotly", "pycocotools", "rosbags", "threadpoolctl", "torch", "torchvision"}

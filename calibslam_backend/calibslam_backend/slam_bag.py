@@ -24,6 +24,7 @@ from calibslam_msgs_py import bags
 from calibslam_msgs_py.bags import BagError, BagReader, BagWriter, refuse_to_replace
 from calibslam_msgs_py.command import ArgumentParser, command
 from calibslam_msgs_py.measurements import SECOND, Boxes, InvalidMeasurement, RelativeMotion
+from calibslam_msgs_py.progress import Progress
 from calibslam_msgs_py.settings import SettingsError, add_arguments, from_arguments
 
 log = logging.getLogger(__name__)
@@ -108,8 +109,9 @@ def slam_bag(
     keyframes: list[Keyframe] = []
     motions: list[int] = []
     first, last = 0, 0
-    progress = _Progress(Path(bag))
-    with BagWriter(out / "run.mcap", overwrite=True) as writer:
+    with BagReader(bag) as reader:
+        length = (reader.end - reader.start) / SECOND
+    with BagWriter(out / "run.mcap", overwrite=True) as writer, Progress(length, Path(bag).name) as progress:
         next_map = 0
         for measurement in recording.measurements():
             stamp = measurement.stamp if isinstance(measurement, Boxes) else measurement.end
@@ -133,7 +135,8 @@ def slam_bag(
                     next_map = keyframe.stamp + int(MAP_PERIOD * SECOND)
                     for topic, message in map_messages(estimator, bags.types):
                         writer.write(f"/{topic}", message, keyframe.stamp)
-            progress.show((last - first) / SECOND, len(keyframes), estimator.objects)
+            progress.note = f"{len(keyframes)} keyframes, {estimator.objects} objects"
+            progress.at((last - first) / SECOND)
         try:
             estimator.finish()
             if batch:
@@ -143,7 +146,6 @@ def slam_bag(
         if estimator.stamps:
             for topic, message in map_messages(estimator, bags.types):
                 writer.write(f"/{topic}", message, estimator.stamps[-1])
-    progress.end()
     recording.rejected["without_odometry"] += estimator.waiting
     record = run_record(
         estimator, keyframes, dict(+recording.rejected), time.perf_counter() - began, (last - first) / SECOND
@@ -206,29 +208,6 @@ def run_record(
         sequence_s=sequence_s,
         settings=dataclasses.asdict(estimator.settings),
     )
-
-
-class _Progress:
-    """One line on a terminal, nothing elsewhere."""
-
-    def __init__(self, bag: Path) -> None:
-        self._bag, self._shown = bag, 0.0
-        with BagReader(bag) as reader:
-            self._length = (reader.end - reader.start) / SECOND
-
-    def show(self, seconds: float, keyframes: int, quadrics: int) -> None:
-        if sys.stderr.isatty() and time.monotonic() - self._shown > 0.2:
-            self._shown = time.monotonic()
-            share = min(seconds / self._length, 1.0) if self._length else 1.0
-            print(
-                f"\r{self._bag.name}: {share:4.0%}  {keyframes} keyframes, {quadrics} objects ",
-                end="",
-                file=sys.stderr,
-            )
-
-    def end(self) -> None:
-        if self._shown:
-            print("\r\033[K", end="", file=sys.stderr)
 
 
 def _summary(out: Path, metrics: dict[str, object], replaces: bool) -> None:

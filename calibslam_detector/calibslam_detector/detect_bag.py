@@ -16,7 +16,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from tqdm import tqdm
 
 from calibslam_detector.images.image_conversion import OVERLAY_QUALITY, decode_image, encode_jpeg
 from calibslam_detector.images.overlay import draw_overlay
@@ -27,6 +26,7 @@ from calibslam_msgs_py.bags import BagError, BagReader, BagWriter, refuse_to_rep
 from calibslam_msgs_py.command import INTERRUPTED, ArgumentParser, command
 from calibslam_msgs_py.conversions import boxes_to_msg, header_to_msg, stamp_from_msg, valid_boxes
 from calibslam_msgs_py.measurements import Boxes, InvalidMeasurement
+from calibslam_msgs_py.progress import Progress
 from calibslam_msgs_py.settings import Settings, SettingsError, add_arguments, from_arguments, setting
 
 RAW, COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
@@ -80,12 +80,12 @@ def detect_bag(bag: Path, out: Path, detector: Detector, settings: DetectBagSett
         everything = merge(
             reader.raw_messages(copied), _marked(image_reader.messages([image_topic])), key=lambda item: item[1]
         )
-        with tqdm(total=reader.counts[image_topic], desc="detecting", unit="image", disable=None) as progress:
+        with Progress(reader.counts[image_topic], "detecting") as progress:
             for topic, time, content in everything:
                 if topic:
                     writer.write_raw(topic, reader.topics[topic], content, time)
                     continue
-                progress.update()
+                progress.step()
                 try:
                     image = decode_image(content)
                     stamp, frame_id = stamp_from_msg(content.header.stamp), str(content.header.frame_id)

@@ -18,7 +18,6 @@ from typing import Any
 import numpy as np
 from pycocotools.coco import COCO
 from pycocotools.cocoeval import COCOeval
-from tqdm import tqdm
 
 from calibslam_detector.calibration import metrics
 from calibslam_detector.calibration.reliability import plot, reliability
@@ -28,6 +27,7 @@ from calibslam_detector.model.weights_file import SHIPPED, WeightsError
 from calibslam_detector.training.matching import free_of_border, match
 from calibslam_msgs_py.command import ArgumentParser, command
 from calibslam_msgs_py.measurements import Array, Boxes, InvalidMeasurement
+from calibslam_msgs_py.progress import followed
 from calibslam_msgs_py.settings import Settings, add_arguments, from_arguments, setting
 
 LEAST_SCORE = 0.05  # of boxes that count for the precision, as torchvision has it
@@ -61,7 +61,7 @@ def detect_all(detector: Detector, data: CocoData) -> tuple[list[Boxes | None], 
     """
     found: list[Boxes | None] = []
     strangeness = []
-    for truth in tqdm(data.images, desc="detecting", unit="image"):
+    for truth in followed(data.images, "detecting"):
         image = read_image(truth.file)
         if image is None:
             found.append(None)

@@ -15,7 +15,6 @@ from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
-from tqdm import tqdm
 
 from calibslam_detector.calibration.metrics import coverage
 from calibslam_detector.foreign_boxes.calibrator import FILE_VERSION, CalibratorError
@@ -25,6 +24,7 @@ from calibslam_detector.foreign_boxes.log_linear import LogLinearCalibrator
 from calibslam_msgs_py.bags import BagError, refuse_to_replace
 from calibslam_msgs_py.command import ArgumentParser, command
 from calibslam_msgs_py.measurements import Array, Boxes
+from calibslam_msgs_py.progress import followed
 from calibslam_msgs_py.settings import SettingsError, settings_fields
 
 MIN_OBJECTS = 5
@@ -164,7 +164,7 @@ def held_out(edges: Edges, folds: int = FOLDS) -> Judgement:
     numbers, counts = np.unique(edges.objects, return_counts=True)
     dealt = numbers[np.argsort(-counts, kind="stable")]  # large and small objects in every fold
     parts = []
-    for fold in tqdm(range(folds), desc="hold-out", disable=None, leave=False):
+    for fold in followed(range(folds), "hold-out"):
         outside = np.isin(edges.objects, dealt[fold::folds])
         parts.append(_Predicted.of(*fit(edges.select(~outside)), edges.select(outside)))
     return _judgement(parts)

@@ -24,10 +24,10 @@ from calibslam_detector.model import weights_file
 from calibslam_detector.model.network import CalibratedDetector
 from calibslam_detector.model.region_cues import CUES
 from calibslam_detector.model.weights_file import WeightsError
-from calibslam_detector.training import run_log
 from calibslam_detector.training.checkpoint import TrainingError
 from calibslam_detector.training.covariance_task import LOSSES, Examples, covariance_task
 from calibslam_detector.training.training_loop import LoopSettings, Task, batch_of, optimise
+from calibslam_msgs_py import progress
 from calibslam_msgs_py.measurements import Boxes
 
 COLOURS = {"cup": (40, 40, 220), "book": (220, 60, 40)}
@@ -298,10 +298,11 @@ def test_the_weights_of_the_best_held_out_loss_are_kept(tmp_path: Path) -> None:
     assert float(module.weight.detach()) == seen[1]
 
 
-def test_without_a_terminal_lines_tell_how_far_it_is(
+def test_how_far_a_training_is_and_its_loss_are_shown(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(run_log, "SECONDS_BETWEEN_LINES", 0.0)
+    for limit in ("SECONDS_BETWEEN_UPDATES", "SECONDS_TO_JUDGE"):
+        monkeypatch.setattr(progress, limit, 0.0)
     module = torch.nn.Linear(1, 1)
     task = Task(
         module,
@@ -310,9 +311,8 @@ def test_without_a_terminal_lines_tell_how_far_it_is(
         torch.device("cpu"),
     )
     optimise(task, LoopSettings(steps=4, log_every=2), tmp_path, {}, resume=False)
-    first, second = capsys.readouterr().err.splitlines()
-    assert re.fullmatch(r"step 1 of 4: loss [\d.]+, 0\.\d min left", first)
-    assert second.startswith("step 3 of 4: loss ")
+    lines = capsys.readouterr().err.splitlines()
+    assert len(lines) == 4 and all(re.fullmatch(r"training: +\d+%(, 0 s left)?, loss [\d.]+", line) for line in lines)
 
 
 @pytest.mark.parametrize("log_every", [1, 3, 1000])

@@ -24,11 +24,11 @@ from calibslam_backend.kernels import load_kernels
 from calibslam_backend.output.object_map import ObjectMap
 from calibslam_msgs_py.bags import BagError, BagReader
 from calibslam_msgs_py.command import ArgumentParser, command
+from calibslam_msgs_py.progress import Progress
 from calibslam_sim import demo_images, topics
 from calibslam_sim.accuracy.reference import read_reference
 from calibslam_sim.evaluate import evaluate, found_objects
 from calibslam_sim.processes import POLL, ProcessFailed, ProcessGroup
-from calibslam_sim.progress import Progress
 from calibslam_sim.run_report.loading import load_runs
 from calibslam_sim.run_report.page import page
 from calibslam_sim.simulation.recording import SCENARIOS, SimulationSettings

@@ -23,8 +23,8 @@ from calibslam_msgs_py.bags import BagError, BagReader
 from calibslam_msgs_py.command import ArgumentParser, command
 from calibslam_msgs_py.conversions import stamp_from_msg
 from calibslam_msgs_py.measurements import SECOND, Array, Boxes, Camera, InvalidMeasurement
+from calibslam_msgs_py.progress import Progress
 from calibslam_sim import topics
-from calibslam_sim.progress import Progress
 from calibslam_sim.run_report.loading import ReportError, own_recording, read_metrics
 
 POINTS = 64  # of an outline

@@ -14,6 +14,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from calibslam_msgs_py.command import INTERRUPTED, ArgumentParser, command
+from calibslam_msgs_py.progress import Progress
 from calibslam_msgs_py.settings import SettingsError, add_arguments, from_arguments
 from calibslam_sim.experiments.design import Experiment, ExperimentError, ExperimentSettings
 from calibslam_sim.experiments.engine import run
@@ -21,7 +22,6 @@ from calibslam_sim.experiments.fingerprint import file_hashes, fingerprint
 from calibslam_sim.experiments.outputs import result_of, table, write
 from calibslam_sim.experiments.registry import MODULES, load
 from calibslam_sim.experiments.run_store import RunStore
-from calibslam_sim.progress import Progress
 
 
 def perform(

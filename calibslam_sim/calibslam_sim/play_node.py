@@ -26,7 +26,7 @@ from calibslam_msgs_py.bags import BagError, BagReader
 from calibslam_msgs_py.command import ArgumentParser
 from calibslam_msgs_py.conversions import RosTypes, stamp_to_msg
 from calibslam_msgs_py.node import LATCHED
-from calibslam_sim.progress import Progress
+from calibslam_msgs_py.progress import Progress
 
 CLOCK_PERIOD = 0.005  # [s] of wall time
 SUBSCRIBER_POLL = 0.02  # [s]

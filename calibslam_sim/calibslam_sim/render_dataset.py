@@ -14,8 +14,8 @@ import numpy as np
 
 from calibslam_msgs_py.command import INTERRUPTED, ArgumentParser, command
 from calibslam_msgs_py.measurements import SECOND
+from calibslam_msgs_py.progress import Progress
 from calibslam_msgs_py.settings import Settings, add_arguments, from_arguments, setting
-from calibslam_sim.progress import Progress
 from calibslam_sim.rendering.coco_writer import CocoError, CocoWriter
 from calibslam_sim.rendering.looks import FAMILIES
 from calibslam_sim.rendering.render import Renderer

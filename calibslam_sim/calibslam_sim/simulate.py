@@ -20,9 +20,9 @@ from calibslam_msgs_py.conversions import (
     stamped_pose_to_msg,
 )
 from calibslam_msgs_py.measurements import QuadricEstimate, StampedPose
+from calibslam_msgs_py.progress import Progress
 from calibslam_msgs_py.settings import add_arguments, from_arguments
 from calibslam_sim import topics
-from calibslam_sim.progress import Progress
 from calibslam_sim.rendering.coco_writer import IMAGES, CocoError, CocoWriter
 from calibslam_sim.rendering.looks import FAMILIES
 from calibslam_sim.rendering.render import RenderedImage, Renderer

@@ -20,8 +20,8 @@ from calibslam_msgs_py import bags
 from calibslam_msgs_py.command import ArgumentParser, command
 from calibslam_msgs_py.conversions import boxes_to_msg, camera_to_msg, header_to_msg, stamped_pose_to_msg
 from calibslam_msgs_py.measurements import Boxes, Camera
+from calibslam_msgs_py.progress import Progress
 from calibslam_sim import topics
-from calibslam_sim.progress import Progress
 from calibslam_sim.tum_folder import (
     FRAME_ID,
     PRESETS,

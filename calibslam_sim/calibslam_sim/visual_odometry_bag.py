@@ -24,10 +24,10 @@ from calibslam_msgs_py.bags import BagError, BagReader, BagWriter, refuse_to_rep
 from calibslam_msgs_py.command import ArgumentParser, command
 from calibslam_msgs_py.conversions import camera_from_msg, motion_to_msg, stamped_pose_from_msg
 from calibslam_msgs_py.measurements import Camera, InvalidMeasurement, RelativeMotion
+from calibslam_msgs_py.progress import Progress
 from calibslam_msgs_py.settings import SettingsError, add_arguments, from_arguments
 from calibslam_sim import topics
 from calibslam_sim.accuracy.motions import motion_accuracy, trajectory_of, truth_noise
-from calibslam_sim.progress import Progress
 from calibslam_sim.rendering.depth_camera import DepthCamera, DepthCameraSettings
 from calibslam_sim.visual_odometry.frame_odometry import Step, VisualOdometrySettings
 from calibslam_sim.visual_odometry.image_pairs import Pair

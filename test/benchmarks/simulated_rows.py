@@ -12,8 +12,8 @@ from simulated_runs import position_nees_at_the_end, quadric_nees, run
 from calibslam_backend.association.matching import ESTIMATED, GIVEN
 from calibslam_backend.estimator import EstimatorSettings
 from calibslam_backend.graph.noise import CALIBRATED, FIXED, QUADRICSLAM
+from calibslam_msgs_py.progress import Progress
 from calibslam_sim.experiments.statistics import nees_interval, paired
-from calibslam_sim.progress import Progress
 from calibslam_sim.simulation.recording import SCENARIOS, SimulationSettings, simulate
 
 OBJECTS = 15

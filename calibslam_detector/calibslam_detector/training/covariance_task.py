@@ -15,7 +15,6 @@ from typing import Any
 import numpy as np
 import torch
 from torch import Tensor
-from tqdm import tqdm
 
 from calibslam_detector.calibration.f_cal import FCal
 from calibslam_detector.calibration.f_cal_cramer import FCalCramer
@@ -27,6 +26,7 @@ from calibslam_detector.model.network import CalibratedDetector, Regions
 from calibslam_detector.training.checkpoint import TrainingError
 from calibslam_detector.training.matching import free_of_border, match
 from calibslam_detector.training.training_loop import LoopSettings, Task, batch_of
+from calibslam_msgs_py.progress import followed
 
 # Each is the likelihood and, with a weight, a demand for calibration (eq. 4.2.6). The weights put both on one scale:
 # the squared Wasserstein distance is in squared units of a sum of K squares, that of Cramer and von Mises is below 1/3.
@@ -73,7 +73,7 @@ def find_examples(model: CalibratedDetector, data: CocoData, device: torch.devic
     model.to(device).eval()
     found = []
     with torch.no_grad():
-        for truth in tqdm(data.images, desc="finding examples", unit="image"):
+        for truth in followed(data.images, "finding examples"):
             image = read_image(truth.file)
             if image is None:
                 skipped["image that cannot be read"] += 1

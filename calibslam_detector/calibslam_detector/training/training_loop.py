@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 import signal
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -19,7 +20,8 @@ from torch import Tensor, nn
 
 from calibslam_detector.training.checkpoint import Best, Checkpoint, TrainingError
 from calibslam_detector.training.curves import plot_curves
-from calibslam_detector.training.run_log import Log, Teller
+from calibslam_detector.training.run_log import Log
+from calibslam_msgs_py.progress import Progress
 from calibslam_msgs_py.settings import Settings, setting
 
 MAX_GRADIENT = 10.0  # norm to which a gradient is cut
@@ -96,7 +98,8 @@ def optimise(task: Task, settings: LoopSettings, folder: Path, identity: dict[st
     checkpoint = Checkpoint(folder / "checkpoint.pt", identity, parts)
     first = checkpoint.load() if resume else 0
     log = Log(folder / "log.csv", first) if task.is_first else None
-    with stop_flag() as stop, Teller(first, settings.steps, task.is_first) as tell:
+    began = time.monotonic()
+    with stop_flag() as stop, Progress(settings.steps, "training", first, task.is_first) as progress:
         for step in range(first, settings.steps):
             try:
                 losses = descent.step(step)
@@ -111,10 +114,12 @@ def optimise(task: Task, settings: LoopSettings, folder: Path, identity: dict[st
                 best.offer(held_out, task.module)
             if is_logged and log is not None and losses:
                 values = losses if held_out is None else {**losses, "held_out": held_out}
-                log.add(step, tell.seconds, settings.rate(step), values)
-                tell.loss(step, sum(losses.values()))
-            tell.step(descent.in_vain)
+                log.add(step, time.monotonic() - began, settings.rate(step), values)
+                progress.note = f"loss {sum(losses.values()):.4g}"
+            if descent.in_vain:
+                progress.note = f"{descent.in_vain} steps that taught nothing"
             done = step + 1
+            progress.at(done)
             stopped = not task.everywhere(not stop())
             if task.is_first and (stopped or done % settings.checkpoint_every == 0 or done == settings.steps):
                 checkpoint.save(done)

@@ -6,8 +6,8 @@ import io
 
 import pytest
 
-from calibslam_sim import progress
-from calibslam_sim.progress import Progress
+from calibslam_msgs_py import progress
+from calibslam_msgs_py.progress import Progress
 
 
 class Terminal(io.StringIO):
@@ -31,7 +31,7 @@ def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
 
 
 def work(stream: io.StringIO, clock: Clock, steps: int, seconds: float) -> str:
-    with Progress(steps, "work", stream) as shown:
+    with Progress(steps, "work", stream=stream) as shown:
         for _ in range(steps):
             clock.now += seconds
             shown.step()
@@ -49,8 +49,36 @@ def test_on_a_terminal_one_line_is_rewritten(clock: Clock) -> None:
     )
 
 
+def test_a_job_that_is_gone_on_with_is_judged_by_what_was_done_now(clock: Clock) -> None:
+    """Half of it was done before; the next tenth took 20 s, so the four that are left take 80."""
+    with Progress(100, "work", done=50.0, stream=(stream := Terminal())) as shown:
+        clock.now += 20.0
+        shown.note = "loss 0.5"
+        shown.at(60.0)
+    assert stream.getvalue() == "\rwork:  60%, 80 s left, loss 0.5\x1b[K\n"
+
+
+def test_a_job_is_shown_only_if_it_is_to_be(clock: Clock) -> None:
+    with Progress(2, "work", is_shown=False, stream=(stream := Terminal())) as shown:
+        clock.now += 20.0
+        shown.step()
+    assert not stream.getvalue()
+
+
+def test_items_are_followed(clock: Clock, capsys: pytest.CaptureFixture[str]) -> None:
+    seen = []
+    for item in progress.followed("abcd", "work"):
+        clock.now += 10.0
+        seen.append(item)
+    assert seen == list("abcd")
+    lines = ["work:  25%, 30 s left", "work:  50%, 20 s left", "work:  75%, 10 s left", "work: 100%"]
+    assert capsys.readouterr().err.splitlines() == lines
+
+
 def test_elsewhere_a_line_tells_each_quarter(clock: Clock) -> None:
-    assert work(io.StringIO(), clock, 8, 1.0) == "work:  25%\nwork:  50%\nwork:  75%\nwork: 100%\n"
+    lines = ["work:  25%, 30 s left", "work:  50%, 20 s left", "work:  75%, 10 s left", "work: 100%"]
+    assert work(io.StringIO(), clock, 8, 5.0).splitlines() == lines
+    assert work(io.StringIO(), clock, 8, 1.0) == ""
 
 
 def test_elsewhere_a_long_job_tells_each_minute(clock: Clock) -> None:
