@@ -186,6 +186,8 @@ METRICS: tuple[tuple[str, str, Callable[[Any], str], bool], ...] = (
     ("RPE [m]", "rpe_m", "{:.4f}".format, True),
     ("RPE of odometry alone [m]", "odometry_rpe_m", "{:.4f}".format, False),
     ("NEES of positions (3 is honest)", "nees_position", "{:.2f}".format, False),
+    ("NEES of motions over 1 keyframe", "nees_motion.1", "{:.2f}".format, False),
+    ("NEES of motions over 30 keyframes", "nees_motion.30", "{:.2f}".format, False),
     ("keyframes", "keyframes", str, False),
     ("objects", "objects", str, False),
     ("boxes used", "boxes_used", str, False),
