@@ -29,6 +29,7 @@ from calibslam_backend.session.intake import Kind
 from calibslam_backend.session.journal import Journal, JournalError
 from calibslam_backend.session.session import NotReady, Session
 from calibslam_backend.session.settings import SessionSettings
+from calibslam_backend.session.tally import USUALLY_LEFT_OUT
 from calibslam_msgs_py.conversions import RosTypes
 from calibslam_msgs_py.measurements import Boxes, InvalidMeasurement, RelativeMotion, StampedPose
 from calibslam_msgs_py.node import (
@@ -38,8 +39,8 @@ from calibslam_msgs_py.node import (
     Counters,
     advertise,
     run,
-    subscribe,
 )
+from calibslam_msgs_py.node_subscription import Subscription
 from calibslam_msgs_py.settings import SettingsError, declare_parameters, setting
 
 SECONDS_TO_SAVE = 3.0  # at the end, for measurements that still wait
@@ -67,7 +68,10 @@ class NodeSettings(SessionSettings):
 
 
 class BackendNode(Node):
-    """detections, relative_pose, camera/camera_info, initialpose -> trajectory, pose, quadrics, quadric_markers."""
+    """detections, relative_pose, camera/camera_info, initialpose, odom -> trajectory, pose, quadrics, quadric_markers, /tf.
+
+    Services: ~/reset, ~/pause, ~/save_map, ~/load_map.
+    """
 
     def __init__(self) -> None:
         super().__init__("backend")
@@ -81,7 +85,7 @@ class BackendNode(Node):
         except ValueError as error:
             raise SettingsError(f"camera_in_body: {error}") from None
         self._types = RosTypes()
-        self._counters = Counters(self, lambda: of_session(self._session))
+        self._counters = Counters(self, lambda: of_session(self._session), usual=USUALLY_LEFT_OUT)
         self._outputs = {topic: advertise(self, self._types(kind), topic, LATCHED) for topic, kind in TOPICS.items()}
         self._map = MapPublisher(self._outputs, self._types, settings.map_frame, settings.map_period)
         self._map_to_odom = MapToOdom(self, settings.map_frame, settings.transform_tolerance, self)
@@ -101,7 +105,8 @@ class BackendNode(Node):
             (Kind.START, "initialpose", MEASUREMENT_INPUT),
         ):
             # As bytes: what cannot be decoded would otherwise end the node, and the journal takes them as they are.
-            subscribe(self, self._counters, TYPES[kind], topic, self._receiver(kind, topic), profile, raw=True)
+            receive, follows = self._receiver(kind, topic), profile is not SENSOR
+            Subscription(self, self._counters, TYPES[kind], topic, receive, profile, raw=True, follows=follows)
         self._map_services = MapServices(
             self, self._session, Path(settings.map_folder), estimator_settings.start_in_map
         )

@@ -17,7 +17,8 @@ from rclpy.node import Node
 from calibslam_detector.foreign_boxes.calibrator import CalibratorError, load
 from calibslam_msgs_py.conversions import BeyondImage, RosTypes, boxes_from_msg, boxes_to_msg, valid_boxes
 from calibslam_msgs_py.measurements import InvalidMeasurement
-from calibslam_msgs_py.node import MEASUREMENT, MEASUREMENT_INPUT, Counters, advertise, run, subscribe
+from calibslam_msgs_py.node import MEASUREMENT, MEASUREMENT_INPUT, Counters, advertise, run
+from calibslam_msgs_py.node_subscription import Subscription
 from calibslam_msgs_py.settings import Settings, SettingsError, declare_parameters, setting
 
 
@@ -42,7 +43,7 @@ class CalibratorNode(Node):
         self._counters = Counters(self)
         self._beyond = BeyondImage()
         self._publisher = advertise(self, BoundingBoxArray, "detections", MEASUREMENT)
-        subscribe(self, self._counters, BoundingBoxArray, "detections_raw", self._receive, MEASUREMENT_INPUT)
+        Subscription(self, self._counters, BoundingBoxArray, "detections_raw", self._receive, MEASUREMENT_INPUT)
 
     def _receive(self, message: Any) -> None:
         try:

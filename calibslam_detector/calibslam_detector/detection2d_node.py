@@ -11,17 +11,14 @@ from typing import Any
 
 from calibslam_msgs.msg import BoundingBoxArray
 from rclpy.node import Node
-from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import CameraInfo
 
 from calibslam_msgs_py.conversions import BeyondImage, RosTypes, boxes_to_msg, camera_from_msg, valid_boxes
 from calibslam_msgs_py.detection_conversions import DETECTIONS_2D, boxes_from_detections_2d
 from calibslam_msgs_py.measurements import Camera, InvalidMeasurement
-from calibslam_msgs_py.node import MEASUREMENT, SENSOR, Counters, advertise, run, subscribe
+from calibslam_msgs_py.node import MEASUREMENT, MEASUREMENT_INPUT, SENSOR, Counters, advertise, run
+from calibslam_msgs_py.node_subscription import Subscription
 from calibslam_msgs_py.settings import SettingsError
-
-# Best effort, so that it connects to detectors of either kind; deep, so that none gets lost here.
-FOREIGN_INPUT = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=100, reliability=ReliabilityPolicy.BEST_EFFORT)
 
 
 class Detection2DNode(Node):
@@ -40,8 +37,10 @@ class Detection2DNode(Node):
         self._counters = Counters(self)
         self._beyond = BeyondImage()
         self._publisher = advertise(self, BoundingBoxArray, "detections_raw", MEASUREMENT)
-        subscribe(self, self._counters, CameraInfo, "camera/camera_info", self._receive_camera, SENSOR)
-        subscribe(self, self._counters, kind, "detections_2d", self._receive, FOREIGN_INPUT)
+        Subscription(
+            self, self._counters, CameraInfo, "camera/camera_info", self._receive_camera, SENSOR, follows=False
+        )
+        Subscription(self, self._counters, kind, "detections_2d", self._receive, MEASUREMENT_INPUT)
 
     def _receive_camera(self, message: Any) -> None:
         try:

@@ -25,8 +25,8 @@ from calibslam_detector.images.overlay import draw_overlay
 from calibslam_detector.model.detector import Detector, DetectorSettings, DeviceError
 from calibslam_detector.model.weights_file import SHIPPED, WeightsError
 from calibslam_msgs_py.conversions import RosTypes, boxes_to_msg, header_to_msg, stamp_from_msg, valid_boxes
-from calibslam_msgs_py.node import MEASUREMENT, SECONDS_BETWEEN_WARNINGS, SENSOR, Counters, advertise, run
-from calibslam_msgs_py.node_sensors import SensorSubscription
+from calibslam_msgs_py.node import IMAGES, MEASUREMENT, SECONDS_BETWEEN_WARNINGS, SENSOR, Counters, advertise, run
+from calibslam_msgs_py.node_subscription import Subscription
 from calibslam_msgs_py.node_worker import NewestWorker
 from calibslam_msgs_py.settings import Settings, SettingsError, declare_parameters, setting
 
@@ -70,17 +70,16 @@ class DetectorNode(Node):
         self._overlay = advertise(self, CompressedImage, "~/overlay/compressed", SENSOR)
         self._strange: deque[bool] = deque(maxlen=STRANGE_WINDOW)
         self._worker = NewestWorker(self, self._counters, self._detect)
-        self._images = [
-            SensorSubscription(self, Image, "camera/image_raw", self._receive),
-            SensorSubscription(self, CompressedImage, "camera/image_raw/compressed", self._receive),
-        ]
+        for kind, topic in ((Image, "camera/image_raw"), (CompressedImage, "camera/image_raw/compressed")):
+            Subscription(self, self._counters, kind, topic, self._receive, IMAGES)
         self.get_logger().info(f"detecting {', '.join(self._detector.class_names)} on {self._detector.device}")
 
     # -- executor's thread --------------------------------------------------------------------------------------
 
     def _receive(self, message: Any) -> None:
-        header = message.header
-        self._worker.put(Waiting(partial(decode_image, message), stamp_from_msg(header.stamp), str(header.frame_id)))
+        stamp, frame_id = stamp_from_msg(message.header.stamp), str(message.header.frame_id)
+        self._counters.arrived("images", stamp)
+        self._worker.put(Waiting(partial(decode_image, message), stamp, frame_id))
 
     # -- worker's thread ----------------------------------------------------------------------------------------
 

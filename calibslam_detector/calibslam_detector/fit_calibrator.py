@@ -23,6 +23,7 @@ from calibslam_detector.foreign_boxes.features import FEATURES, edge_features
 from calibslam_detector.foreign_boxes.log_linear import LogLinearCalibrator
 from calibslam_msgs_py.bags import BagError, refuse_to_replace
 from calibslam_msgs_py.command import ArgumentParser, command
+from calibslam_msgs_py.files import write_whole
 from calibslam_msgs_py.measurements import Array, Boxes
 from calibslam_msgs_py.progress import followed
 from calibslam_msgs_py.settings import SettingsError, settings_fields
@@ -235,7 +236,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             "parameters": asdict(result),
             "fitted_on": fitted_on,
         }
-        parsed.out.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
+        write_whole(parsed.out, (json.dumps(content, indent=2) + "\n").encode())
     except (BagError, CalibratorError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 1

@@ -21,6 +21,7 @@ import torch
 from calibslam_detector.calibration.residuals import CalibrationError
 from calibslam_detector.images.coco_data import BOX_KEYS, CocoData, DataError, load_coco_data
 from calibslam_detector.model import weights_file
+from calibslam_detector.model.detector import use_threads
 from calibslam_detector.model.network import ARCHITECTURES, CalibratedDetector
 from calibslam_detector.model.weights_file import WeightsError
 from calibslam_detector.training.checkpoint import TrainingError
@@ -44,6 +45,7 @@ class TrainSettings(Settings):
     architecture: str = setting("compact", "network, where none is given to begin with", choices=tuple(ARCHITECTURES))
     batch: int = setting(8, "images per step and process, in stage detector", low=1)
     workers: int = setting(0, "processes that read images", low=0)
+    threads: int = setting(0, "of the CPU; 0: one less than it has cores", low=0)
     regions: int = setting(512, "detections per step, in stage covariance", low=64)
     loss: str = setting("f_cal_cramer", "of the covariance head", choices=tuple(LOSSES))
     boxes: str = setting(BOX_KEYS[0], "which boxes are learnt: of visible parts or of whole objects", choices=BOX_KEYS)
@@ -56,6 +58,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         settings = from_arguments(arguments, TrainSettings)
         loop = from_arguments(arguments, LoopSettings)
+        use_threads(settings.threads)
         stage = _train_detector if arguments.stage == "detector" else _train_covariance
         stage(arguments, settings, loop)
     except (DataError, WeightsError, TrainingError, CalibrationError) as error:
@@ -118,7 +121,10 @@ def _train_covariance(arguments: argparse.Namespace, settings: TrainSettings, lo
         lambda: find_examples(model, data, device, skipped),
     )
     if len(examples) < MIN_EXAMPLES:
-        raise TrainingError(f"only {len(examples)} boxes were found again by the detector; {MIN_EXAMPLES} are needed")
+        raise TrainingError(
+            f"only {len(examples)} boxes were found again by the detector; {MIN_EXAMPLES} are needed: begin with more "
+            "images, in another folder"
+        )
     print(f"{len(examples)} boxes found again, {int(examples.whole.sum())} of them of objects wholly in the image")
     model.familiarity.fit(examples.descriptors.to(device))
     torch.manual_seed(loop.seed)
@@ -130,7 +136,7 @@ def _train_covariance(arguments: argparse.Namespace, settings: TrainSettings, lo
 def _identity(settings: TrainSettings, loop: LoopSettings, data: CocoData, origin: dict[str, str]) -> dict[str, Any]:
     """What must stay the same for a training to be gone on with; `origin`: checksums of what it begins with."""
     content = {**asdict(settings), "steps": loop.steps, "seed": loop.seed}
-    del content["workers"]
+    del content["workers"], content["threads"]
     checksums = {f"checksum of the {name}": value for name, value in origin.items()}
     return {**content, "images": len(data.images), "classes": list(data.class_names), **checksums}
 

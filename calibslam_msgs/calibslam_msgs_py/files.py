@@ -6,7 +6,11 @@ from pathlib import Path
 
 
 def write_whole(path: Path, data: bytes) -> None:
-    """Write a file in one step: where that fails or is interrupted, an earlier one stays as it was."""
+    """Write a file in one step, and its folders where they lack.
+
+    Where that fails or is interrupted, an earlier file stays as it was.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
     partial = path.with_name(path.name + ".part")
     try:
         partial.write_bytes(data)

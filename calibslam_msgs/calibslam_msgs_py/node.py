@@ -8,7 +8,7 @@ import sys
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from copy import copy
 from typing import Any
 
@@ -16,7 +16,6 @@ import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy.clock import Clock, ClockType
 from rclpy.context import Context
-from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.executors import Executor, ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos import (
@@ -34,8 +33,9 @@ from calibslam_msgs_py.measurements import SECOND, InvalidMeasurement
 from calibslam_msgs_py.parameter_files import NodeParameters
 from calibslam_msgs_py.settings import SettingsError
 
-# Raw sensor input: best effort, so that it connects to every publisher.
 SENSOR: QoSProfile = qos_profile_sensor_data
+# Of images a subscription has room for a few: the newest ones are wanted.
+IMAGES = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
 # Boxes and motions: none may get lost. Kept for who asks for the last ones (transient local), as after a restart.
 MEASUREMENT = QoSProfile(
     history=HistoryPolicy.KEEP_LAST,
@@ -171,12 +171,18 @@ class Counters:
     Args:
         node: that publishes.
         describe: gives further values, by name, when they are published.
+        usual: counters that grow where all is well.
     """
 
     WARN, ERROR = ("rejected", "lost"), ("errors",)
 
-    def __init__(self, node: Node, describe: Callable[[], Mapping[str, object]] | None = None) -> None:
-        self._node, self._describe = node, describe
+    def __init__(
+        self,
+        node: Node,
+        describe: Callable[[], Mapping[str, object]] | None = None,
+        usual: Collection[str] = (),
+    ) -> None:
+        self._node, self._describe, self._usual = node, describe, usual
         self._counting = threading.Lock()  # several threads may count
         self._throttle = _Throttle()
         self._counts: Counter[str] = Counter()
@@ -219,7 +225,7 @@ class Counters:
             counts = self._counts.copy()
         growing = [name for name, count in sorted(counts.items()) if count > self._published[name]]
         errors = [name for name in growing if name.startswith(self.ERROR)]
-        warnings = [name for name in growing if name.startswith(self.WARN)]
+        warnings = [name for name in growing if name.startswith(self.WARN) and name not in self._usual]
         self._published = counts
         values = {name: str(count) for name, count in sorted(counts.items())} | self._values
         for name, each in self._inputs.items():
@@ -287,36 +293,3 @@ def advertise(node: Node, kind: Any, topic: str, profile: QoSProfile) -> Any:
     """A publisher whose quality of service can be overridden by parameters."""
     # A copy: rclpy writes the overrides into the profile itself.
     return node.create_publisher(kind, topic, copy(profile), qos_overriding_options=QOS_OVERRIDES)
-
-
-def subscribe(
-    node: Node,
-    counters: Counters,
-    kind: Any,
-    topic: str,
-    receive: Callable[[Any], None],
-    profile: QoSProfile,
-    raw: bool = False,
-) -> None:
-    """A subscription whose quality of service can be overridden by parameters.
-
-    What the middleware loses of a reliable topic is counted as `lost_TOPIC`; a publisher that it cannot connect to is
-    named in a warning.
-
-    Args:
-        receive: takes a message, or with `raw` its bytes.
-    """
-
-    def lost(info: Any) -> None:
-        if profile.reliability == ReliabilityPolicy.RELIABLE:  # the others may lose what they like
-            counters.count(f"lost_{topic}", info.total_count_change)
-
-    node.create_subscription(
-        kind,
-        topic,
-        receive,
-        copy(profile),
-        raw=raw,
-        qos_overriding_options=QOS_OVERRIDES,
-        event_callbacks=SubscriptionEventCallbacks(message_lost=lost),
-    )

@@ -62,6 +62,16 @@ def test_a_file_in_the_way_is_said(
     assert capsys.readouterr().err.startswith(f"test_command: {told}")
 
 
+def test_a_wrong_option_is_one_line(capsys: pytest.CaptureFixture[str]) -> None:
+    parser = ArgumentParser(prog="work")
+    for n in range(40):
+        parser.add_argument(f"--option-{n}")
+    with pytest.raises(SystemExit) as ended:
+        parser.parse_args(["--optoin-3", "x"])
+    assert ended.value.code == 2
+    assert capsys.readouterr().err == "work: error: unrecognized arguments: --optoin-3 x; see work --help\n"
+
+
 def test_an_interrupted_command_says_so(capsys: pytest.CaptureFixture[str]) -> None:
     @command
     def main() -> int:

@@ -14,11 +14,12 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.parameter import Parameter
-from rclpy.qos import DurabilityPolicy
+from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
 from std_msgs.msg import String
 
 from calibslam_msgs_py.measurements import SECOND, InvalidMeasurement
-from calibslam_msgs_py.node import LATCHED, MEASUREMENT, MEASUREMENT_INPUT, SENSOR, Counters, subscribe
+from calibslam_msgs_py.node import LATCHED, MEASUREMENT, MEASUREMENT_INPUT, SENSOR, Counters
+from calibslam_msgs_py.node_subscription import Subscription
 
 PATIENCE = 120.0  # [s] for what takes a second on an idle machine
 NODE = textwrap.dedent("""
@@ -182,12 +183,44 @@ def test_warnings_do_not_swallow_each_other(
     assert len(capfd.readouterr().err.splitlines()) < 100 and len(counters._throttle._said) <= 100
 
 
+def test_what_is_usually_left_out_is_no_reason_to_warn(nodes: tuple[Node, Node, SingleThreadedExecutor]) -> None:
+    one, other, executor = nodes
+    received: list[DiagnosticArray] = []
+    other.create_subscription(DiagnosticArray, "/diagnostics", received.append, 10)
+    counters = Counters(one, usual=("rejected_double_box",))
+    counters.count("rejected_double_box", 3)
+    spin_until(executor, lambda: received)
+    (status,) = received[0].status
+    assert (status.level, status.message) == (DiagnosticStatus.OK, "running")
+    assert {v.key: v.value for v in status.values}["rejected_double_box"] == "3"
+
+
+def test_who_asks_for_a_reliability_has_it(nodes: tuple[Node, Node, SingleThreadedExecutor]) -> None:
+    """Otherwise it is that of the publishers."""
+    _, other, executor = nodes
+    name = "qos_overrides./asked.subscription.reliability"
+    node = Node("overridden", context=other.context, parameter_overrides=[Parameter(name, value="reliable")])
+    executor.add_node(node)
+    counters = Counters(node)
+    for topic in ("asked", "free"):
+        Subscription(node, counters, String, topic, print, MEASUREMENT_INPUT)
+        other.create_publisher(String, topic, SENSOR)
+
+    def reliability(topic: str) -> ReliabilityPolicy:
+        return node.get_subscriptions_info_by_topic(f"/{topic}")[0].qos_profile.reliability
+
+    spin_until(executor, lambda: reliability("free") == ReliabilityPolicy.BEST_EFFORT)
+    assert reliability("asked") == ReliabilityPolicy.RELIABLE
+    executor.remove_node(node)
+    node.destroy_node()
+
+
 def test_an_override_is_of_one_topic_only(nodes: tuple[Node, Node, SingleThreadedExecutor]) -> None:
     name = "qos_overrides./kept.subscription.durability"
     node = Node("overridden", context=nodes[0].context, parameter_overrides=[Parameter(name, value="transient_local")])
     counters = Counters(node)
     for topic in ("kept", "plain"):
-        subscribe(node, counters, String, topic, print, MEASUREMENT_INPUT)
+        Subscription(node, counters, String, topic, print, MEASUREMENT_INPUT)
     found = {
         topic: node.get_subscriptions_info_by_topic(f"/{topic}")[0].qos_profile.durability
         for topic in ("kept", "plain")

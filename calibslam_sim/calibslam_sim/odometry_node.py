@@ -25,7 +25,8 @@ from calibslam_msgs_py.conversions import (
     stamped_pose_from_msg,
 )
 from calibslam_msgs_py.measurements import InvalidMeasurement, RelativeMotion
-from calibslam_msgs_py.node import MEASUREMENT, MEASUREMENT_INPUT, Counters, advertise, run, subscribe
+from calibslam_msgs_py.node import MEASUREMENT, MEASUREMENT_INPUT, Counters, advertise, run
+from calibslam_msgs_py.node_subscription import Subscription
 from calibslam_msgs_py.settings import Settings, SettingsError, declare_parameters, setting
 from calibslam_sim.simulation.odometry_noise import OdometryNoise, add_noise
 from calibslam_sim.simulation.random_streams import stream
@@ -68,9 +69,9 @@ class OdometryNode(Node):
         self._counters = Counters(self)
         self._publisher = advertise(self, RelativePose, "relative_pose", MEASUREMENT)
         if settings.source == "odom":
-            subscribe(self, self._counters, Odometry, "odom", self._receive_odometry, MEASUREMENT_INPUT)
+            Subscription(self, self._counters, Odometry, "odom", self._receive_odometry, MEASUREMENT_INPUT)
         else:
-            subscribe(self, self._counters, PoseStamped, "ground_truth", self._receive_truth, MEASUREMENT_INPUT)
+            Subscription(self, self._counters, PoseStamped, "ground_truth", self._receive_truth, MEASUREMENT_INPUT)
 
     def _receive_odometry(self, message: Any) -> None:
         try:

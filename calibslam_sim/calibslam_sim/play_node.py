@@ -1,7 +1,7 @@
 """`play`: publishes a bag with /clock, as `ros2 bag play --clock` does, and loses nothing.
 
-Every topic is published reliably (which serves best-effort subscribers too); camera information, maps and
-static transforms also for who joins late. ROS options (remapping, namespace) follow --ros-args.
+Every topic is published reliably (which serves best-effort subscribers too); measurements, camera information, maps and
+static transforms also for who asks for what was before. ROS options (remapping, namespace) follow --ros-args.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from typing import Any
 import rclpy
 from rclpy.duration import Duration
 from rclpy.node import Node
-from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.signals import SignalHandlerOptions
 from rclpy.utilities import remove_ros_args
 from rosgraph_msgs.msg import Clock
@@ -33,8 +33,22 @@ SUBSCRIBER_POLL = 0.02  # [s]
 SECONDS_TO_CONNECT = 1.0
 ACKNOWLEDGE_TIMEOUT = 10.0  # [s]
 LATCHED_TYPES = ("sensor_msgs/msg/CameraInfo", "calibslam_msgs/msg/QuadricArray", "tf2_msgs/msg/TFMessage")
+# Measurements are kept for who asks for them, as the nodes that make them do.
+KEPT_TYPES = (
+    "calibslam_msgs/msg/BoundingBoxArray",
+    "calibslam_msgs/msg/RelativePose",
+    "nav_msgs/msg/Odometry",
+    "geometry_msgs/msg/PoseStamped",
+    "vision_msgs/msg/Detection2DArray",
+)
 # Deep: at high rates a subscriber may be busy for a while.
 PLAYED = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=2000, reliability=ReliabilityPolicy.RELIABLE)
+KEPT = QoSProfile(
+    history=HistoryPolicy.KEEP_LAST,
+    depth=PLAYED.depth,
+    reliability=ReliabilityPolicy.RELIABLE,
+    durability=DurabilityPolicy.TRANSIENT_LOCAL,
+)
 
 
 class PlayError(Exception):
@@ -65,7 +79,8 @@ class Player(Node):
             self.get_logger().warning(f"{topic} is not played: there is no Python package for {kind} here")
             return
         latched = kind in LATCHED_TYPES and topic != "/tf"
-        self._publishers_by_topic[topic] = self.create_publisher(message_class, topic, LATCHED if latched else PLAYED)
+        profile = LATCHED if latched else KEPT if kind in KEPT_TYPES else PLAYED
+        self._publishers_by_topic[topic] = self.create_publisher(message_class, topic, profile)
 
     def wait_for_subscribers(self, expected: dict[str, int], timeout: float) -> None:
         """Until each topic, played here or by other nodes, has at least so many subscribers.

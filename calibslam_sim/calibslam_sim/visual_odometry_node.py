@@ -15,10 +15,10 @@ from calibslam_msgs.msg import RelativePose
 from rclpy.node import Node
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 
-from calibslam_msgs_py.conversions import RosTypes, camera_from_msg, motion_to_msg
+from calibslam_msgs_py.conversions import RosTypes, camera_from_msg, motion_to_msg, stamp_from_msg
 from calibslam_msgs_py.measurements import InvalidMeasurement
-from calibslam_msgs_py.node import MEASUREMENT, SECONDS_BETWEEN_WARNINGS, SENSOR, Counters, advertise, run, subscribe
-from calibslam_msgs_py.node_sensors import SensorSubscription
+from calibslam_msgs_py.node import IMAGES, MEASUREMENT, SECONDS_BETWEEN_WARNINGS, SENSOR, Counters, advertise, run
+from calibslam_msgs_py.node_subscription import Subscription
 from calibslam_msgs_py.node_worker import NewestWorker
 from calibslam_msgs_py.settings import declare_parameters
 from calibslam_sim.rendering.depth_camera import DepthCamera, DepthCameraSettings
@@ -37,16 +37,16 @@ class VisualOdometryNode(Node):
         self._counters = Counters(self)
         self._publisher = advertise(self, RelativePose, "relative_pose", MEASUREMENT)
         self._worker = NewestWorker(self, self._counters, self._follow)
-        subscribe(self, self._counters, CameraInfo, "camera/camera_info", self._receive_camera, SENSOR)
-        self._images = [
-            SensorSubscription(self, kind, topic, receive)
-            for kind, topic, receive in (
-                (Image, "camera/image_raw", self._receive_image),
-                (CompressedImage, "camera/image_raw/compressed", self._receive_image),
-                (Image, "camera/depth/image_raw", self._receive_depth),
-                (CompressedImage, "camera/depth/image_raw/compressedDepth", self._receive_depth),
-            )
-        ]
+        Subscription(
+            self, self._counters, CameraInfo, "camera/camera_info", self._receive_camera, SENSOR, follows=False
+        )
+        for kind, topic, receive in (
+            (Image, "camera/image_raw", self._receive_image),
+            (CompressedImage, "camera/image_raw/compressed", self._receive_image),
+            (Image, "camera/depth/image_raw", self._receive_depth),
+            (CompressedImage, "camera/depth/image_raw/compressedDepth", self._receive_depth),
+        ):
+            Subscription(self, self._counters, kind, topic, receive, IMAGES)
 
     # -- executor's thread --------------------------------------------------------------------------------------
 
@@ -57,9 +57,11 @@ class VisualOdometryNode(Node):
             self._counters.reject(error)
 
     def _receive_image(self, message: Any) -> None:
+        self._counters.arrived("images", stamp_from_msg(message.header.stamp))
         self._put(self._camera.add_image(message))
 
     def _receive_depth(self, message: Any) -> None:
+        self._counters.arrived("depth", stamp_from_msg(message.header.stamp))
         self._put(self._camera.add_depth(message))
 
     def _put(self, pairs: list[Pair[Any, Any]]) -> None:

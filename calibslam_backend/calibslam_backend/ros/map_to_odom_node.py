@@ -12,6 +12,7 @@ from typing import Any
 
 import gtsam
 import numpy as np
+from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
 
 from calibslam_backend.geometry.transform import on_the_way
 from calibslam_backend.session.intake import Report
@@ -20,6 +21,11 @@ from calibslam_msgs_py.conversions import RosTypes, odometry_from_msg
 from calibslam_msgs_py.geometry_conversions import transform_to_msg
 from calibslam_msgs_py.measurements import SECOND, Array, InvalidMeasurement, StampedPose
 from calibslam_msgs_py.node import MEASUREMENT_INPUT
+
+# Of whatever publisher: the transform bears that some are lost.
+ODOMETRY_INPUT = QoSProfile(
+    history=HistoryPolicy.KEEP_LAST, depth=MEASUREMENT_INPUT.depth, reliability=ReliabilityPolicy.BEST_EFFORT
+)
 
 
 def map_to_odom(T_map_body: Array, T_odom_body: Array) -> Array:
@@ -101,7 +107,7 @@ class MapToOdom:
         from nav_msgs.msg import Odometry
 
         self._publisher = node.create_publisher(TFMessage, "/tf", 100)
-        node.create_subscription(Odometry, "odom", self._receive, MEASUREMENT_INPUT)
+        node.create_subscription(Odometry, "odom", self._receive, ODOMETRY_INPUT)
 
     def _receive(self, message: Any) -> None:
         try:

@@ -9,8 +9,16 @@ from collections.abc import Sequence
 from calibslam_backend.estimator import Estimator
 from calibslam_backend.keyframe import Keyframe
 from calibslam_backend.session.intake import Report
+from calibslam_msgs_py.measurements import InvalidMeasurement
 
 WINDOW = 1000  # that statistics are of
+# What an estimator leaves out where all is well: second boxes of an object, and boxes that do not fit.
+USUALLY_LEFT_OUT = ("rejected_double_box", "rejected_misfit")
+# What else, in words.
+LEFT_OUT = {
+    "rejected_before_odometry": "images from before the first motion",
+    "rejected_no_identity": "boxes without identity, and association is given",
+}
 
 
 class Tally:
@@ -37,7 +45,11 @@ class Tally:
         if estimator.counts is not self._counts:
             self._counts, self._told = estimator.counts, Counter()
         for name, count in (self._counts - self._told).items():
-            self._report.count(name, count)
+            if name in LEFT_OUT:
+                reason = name.removeprefix("rejected_")
+                self._report.reject(InvalidMeasurement(reason, f"{count} {LEFT_OUT[name]}"), count)
+            else:
+                self._report.count(name, count)
         self._told = self._counts.copy()
 
     def keyframes(self, keyframes: Sequence[Keyframe], arrived: float) -> None:

@@ -1,0 +1,95 @@
+"""Subscriptions that are as reliable as who publishes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from copy import copy
+from typing import Any
+
+from rclpy.clock import Clock, ClockType
+from rclpy.event_handler import SubscriptionEventCallbacks
+from rclpy.node import Node
+from rclpy.qos import QoSPolicyKind, QoSProfile, ReliabilityPolicy
+from rclpy.qos_overriding_options import QoSOverridingOptions
+
+from calibslam_msgs_py.node import QOS_OVERRIDES, Counters
+
+LOOK_PERIOD = 0.5  # [s] of wall time between two looks at the publishers
+# Once reliability is what the publishers offer, it is no parameter any more.
+OTHER_OVERRIDES = QoSOverridingOptions(
+    [kind for kind in QOS_OVERRIDES.policy_kinds if kind != QoSPolicyKind.RELIABILITY]
+)
+
+
+class Subscription:
+    """Reliable where all publishers are, best effort where one is not.
+
+    A reliable subscription does not connect to a publisher that is best effort, as many drivers are. A best-effort one
+    connects to all, but loses what comes while the process is busy, and most messages that are larger than a
+    transport's buffers, as raw images are.
+
+    Its quality of service can be overridden by parameters; who sets reliability there has what he asks for. What the
+    middleware loses of a topic that is meant to be reliable is counted as `lost_TOPIC`.
+
+    Args:
+        node: that it belongs to.
+        counters: of the node.
+        kind: class of the messages.
+        topic: relative or absolute name.
+        receive: takes a message, or with `raw` its bytes.
+        profile: quality of service; its reliability is that before any publisher is known.
+        raw: whether messages are left as bytes.
+        follows: whether its reliability is that of the publishers. What comes while it changes may be lost.
+    """
+
+    def __init__(
+        self,
+        node: Node,
+        counters: Counters,
+        kind: Any,
+        topic: str,
+        receive: Callable[[Any], None],
+        profile: QoSProfile,
+        raw: bool = False,
+        follows: bool = True,
+    ) -> None:
+        self._node, self._counters, self._kind, self._topic = node, counters, kind, topic
+        self._receive, self._profile, self._raw = receive, profile, raw
+        self._reliability = profile.reliability
+        self._subscription = self._subscribe(QOS_OVERRIDES)
+        chosen = f"qos_overrides.{self._subscription.topic_name}.subscription.reliability" in node._parameter_overrides
+        if follows and not chosen:
+            self._timer = node.create_timer(LOOK_PERIOD, self._match, clock=Clock(clock_type=ClockType.STEADY_TIME))
+
+    def _subscribe(self, overrides: QoSOverridingOptions) -> Any:
+        # A copy: rclpy writes the overrides into the profile itself.
+        profile = copy(self._profile)
+        profile.reliability = self._reliability
+        return self._node.create_subscription(
+            self._kind,
+            self._topic,
+            self._receive,
+            profile,
+            raw=self._raw,
+            qos_overriding_options=overrides,
+            event_callbacks=SubscriptionEventCallbacks(message_lost=self._lost),
+        )
+
+    def _lost(self, info: Any) -> None:
+        # What is best effort may lose what it likes.
+        if self._profile.reliability == self._reliability == ReliabilityPolicy.RELIABLE:
+            self._counters.count(f"lost_{self._topic}", info.total_count_change)
+
+    def _match(self) -> None:
+        offered = {
+            publisher.qos_profile.reliability
+            for publisher in self._node.get_publishers_info_by_topic(self._subscription.topic_name)
+        }
+        if not offered:
+            return
+        best_effort = ReliabilityPolicy.BEST_EFFORT in offered
+        reliability = ReliabilityPolicy.BEST_EFFORT if best_effort else ReliabilityPolicy.RELIABLE
+        if reliability != self._reliability:
+            self._reliability = reliability
+            self._node.destroy_subscription(self._subscription)
+            self._subscription = self._subscribe(OTHER_OVERRIDES)
