@@ -68,9 +68,9 @@ class NodeSettings(SessionSettings):
 
 
 class BackendNode(Node):
-    """detections, relative_pose, camera/camera_info, initialpose, odom -> trajectory, pose, quadrics, quadric_markers, /tf.
+    """detections, relative_pose, camera/camera_info, initialpose, odom -> trajectory, pose, quadrics, quadric_markers.
 
-    Services: ~/reset, ~/pause, ~/save_map, ~/load_map.
+    Where tf2_msgs is installed, /tf; services ~/reset, ~/pause, ~/save_map, ~/load_map.
     """
 
     def __init__(self) -> None:

@@ -49,7 +49,9 @@ class GraphSettings(Settings):
         True, "whether boxes count less where the errors of an object's boxes in consecutive keyframes are alike"
     )
     robust_odometry: float = setting(3.5, "Mahalanobis distance beyond which a motion is doubted", low=0.1, high=1e6)
-    prior_sigma: float = setting(0.001, "first pose: it is the map's origin", unit="rad and m", low=1e-6)
+    prior_sigma: float = setting(
+        0.001, "of the first pose, which is the origin of the map: standard deviation", unit="rad and m", low=1e-6
+    )
     relinearised: int = setting(60, "earlier keyframes, with every second new one, that may be relinearised", low=1)
     relinearise_pose: float = setting(0.02, "change of a pose that asks for one", unit="rad and m", low=0.0)
     relinearise_quadric: float = setting(0.03, "change of a quadric that asks for one", unit="m and log m", low=0.0)

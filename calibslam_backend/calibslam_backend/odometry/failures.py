@@ -41,13 +41,20 @@ class FailureSettings(Settings):
         100.0, "speed that a body can have: a faster motion is a failure of odometry", unit="m/s", low=0.1
     )
     agility: float = setting(
-        1.0, "how much a body's velocity changes in one second: standard deviation", unit="m/s and rad/s", low=1e-3
+        1.0,
+        "how much the body's velocity changes in one second: standard deviation; raise it for racing drones",
+        unit="m/s and rad/s",
+        low=1e-3,
     )
     failure_error: float = setting(
         1.0, "how wrong velocities are when odometry fails: standard deviation", unit="m/s and rad/s", low=1e-3
     )
-    failure_begins: float = setting(0.02, "share of good steps after which odometry fails", low=0.0, high=0.5)
-    failure_ends: float = setting(0.15, "share of failed steps after which it is good again", low=0.01, high=1.0)
+    failure_begins: float = setting(
+        0.02, "probability that odometry fails in a step that follows a good one", low=0.0, high=0.5
+    )
+    failure_ends: float = setting(
+        0.15, "probability that it is good again in a step that follows a failed one", low=0.01, high=1.0
+    )
 
 
 @dataclass(frozen=True)

@@ -40,7 +40,11 @@ class MotionNoise(FailureSettings):
         0.005, "unknown odometry noise: rotation, after one second at rest", unit="rad/sqrt(s)", low=1e-6
     )
     rotation_share: float = setting(
-        0.036, "unknown odometry noise: share of the rotation of one second", unit="sqrt(s)", low=0.0, high=1.0
+        0.036,
+        "unknown odometry noise: share of the rotation, after one second of steady turning",
+        unit="sqrt(s)",
+        low=0.0,
+        high=1.0,
     )
     roll_share: float = setting(
         0.6, "unknown odometry noise: of rotation about the optical axis, as share of that about others", low=0.01
@@ -49,7 +53,11 @@ class MotionNoise(FailureSettings):
         0.004, "unknown odometry noise: translation, after one second at rest", unit="m/sqrt(s)", low=1e-6
     )
     translation_share: float = setting(
-        0.018, "unknown odometry noise: share of the translation of one second", unit="sqrt(s)", low=0.0, high=1.0
+        0.018,
+        "unknown odometry noise: share of the translation, after one second of steady motion",
+        unit="sqrt(s)",
+        low=0.0,
+        high=1.0,
     )
     scene_depth: float = setting(
         1.0, "unknown odometry noise: how far away is what it sees; 0 if it is not visual", unit="m", low=0.0

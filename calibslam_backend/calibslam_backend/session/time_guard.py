@@ -27,7 +27,10 @@ class TimeSettings(Settings):
         choices=(REJECT, RESET, KEEP_MAP),
     )
     largest_gap: float = setting(
-        10.0, "odometry farther ahead of the last is believed when five motions agree", unit="s", low=0.1
+        10.0,
+        "longest gap of odometry that is bridged; what is farther ahead is believed once five motions agree",
+        unit="s",
+        low=0.1,
     )
 
 

@@ -40,8 +40,12 @@ class VisualOdometrySettings(Settings):
         high=0.1,
     )  # fmt: skip
     corners: int = setting(500, "corners to follow", low=50, high=5000)
-    min_corners: int = setting(30, "fewer that agree on a motion are none", low=6, high=1000)
-    keep: float = setting(0.6, "share of a reference's corners below which a new one begins", low=0.1, high=0.95)
+    min_corners: int = setting(
+        30, "fewest corners that must agree on a motion; with fewer the camera is lost", low=6, high=1000
+    )
+    keep: float = setting(
+        0.6, "a new reference image is taken when a smaller share of its corners is still found", low=0.1, high=0.95
+    )
     reference_images: int = setting(10, "images after which a new reference begins", low=1, high=1000)
     min_depth: float = setting(0.3, "nearest depth to believe", unit="m", low=0.0)
     max_depth: float = setting(5.0, "farthest depth to believe", unit="m", low=0.1)
