@@ -453,6 +453,15 @@ def test_images_that_wait_when_a_new_trajectory_begins_are_counted() -> None:
     assert (early.estimator.waiting, early.counts["rejected_no_odometry"]) == (1, 0)
 
 
+def test_what_the_estimator_leaves_out_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Images from before the first motion shorten a trajectory without a trace otherwise."""
+    session, said = live(), list[tuple[str, str, int]]()
+    monkeypatch.setattr(session, "reject", lambda error, count: said.append((error.reason, str(error), count)))
+    early = [replace(boxes, stamp=boxes.stamp - 60 * 10**9) for boxes in WORLD.boxes()[:3]]
+    session.use([*early, *WORLD.motions()[:5], *WORLD.boxes()[:5]])
+    assert said == [("before_odometry", "3 images from before the first motion", 3)]
+
+
 def test_images_without_odometry_are_bounded() -> None:
     session = live(settings=SessionSettings(images_without_odometry=50))
     session.use(WORLD.boxes())
