@@ -16,7 +16,7 @@ from calibslam_sim.experiments.design import Metric, Metrics
 SPANS = (1, 10, 30)  # keyframes; motions over so many are looked at
 HONESTY = {
     "nees_position": Metric("NEES of a position (3 is honest)", is_error=False),
-    **{f"nees_motion_{n}": Metric(f"NEES of motions over {n} keyframes", is_error=False) for n in SPANS},
+    **{f"nees_motion_{n}": Metric(f"NEES of motions over {n} keyframe{'s' * (n > 1)}", is_error=False) for n in SPANS},
 }
 
 
