@@ -94,7 +94,10 @@ def _curve(panel: Axes, result: dict[str, Any], metric: str, curve: Curve, style
 def condition_figure(
     path: Path, title: str, result: dict[str, Any], metrics: Mapping[str, Metric], conditions: Sequence[str]
 ) -> None:
-    """A panel for each metric: every repetition as a dot, the mean and its 95 % interval beside."""
+    """A panel for each metric: every repetition as a dash, the mean and its 95 % interval beside.
+
+    Panels reach as far as repetitions do: where these are nearly the same, an interval can be much wider.
+    """
     columns = min(len(metrics), 3)
     rows = -(-len(metrics) // columns)
     height = 1.4 + 0.42 * len(conditions)
@@ -109,6 +112,9 @@ def condition_figure(
             if len(values):
                 half = half_interval(values, result.get("left_out", {}).get(condition, 0.0))
                 panel.errorbar(found["mean"], place - 0.1, xerr=half, fmt="o", color="black", capsize=4)
+        every = np.concatenate([defined(result["conditions"][condition][metric]["values"]) for condition in conditions])
+        if len(every) and np.ptp(every) > 0.0:
+            panel.set_xlim(every.min() - 0.05 * np.ptp(every), every.max() + 0.05 * np.ptp(every))
         panel.set_yticks(places, conditions if i % columns == 0 else [""] * len(conditions))
         panel.set_ylim(-0.6, len(conditions) - 0.4)
         panel.xaxis.set_major_locator(MaxNLocator(5))
