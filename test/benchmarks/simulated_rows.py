@@ -46,11 +46,12 @@ def long_run_rows(keyframes: int) -> list[AnyRow]:
 
 
 def honesty_rows(seeds: int, duration: float) -> list[AnyRow]:
-    """NEES of the last position of each run, and coverage of quadrics, with boxes' covariances right and wrong.
+    """NEES of the last position of each run and of motions, coverage of quadrics; boxes' covariances right and wrong.
 
     Association given, everything else as it is by default.
     """
     positions: dict[float, list[float]] = {1.0: [], 0.5: [], 2.0: []}
+    motions: dict[int, list[float]] = {}
     quadrics: list[float] = []
     with Progress(seeds * len(positions), "covariances") as progress:
         for seed in range(seeds):
@@ -58,7 +59,10 @@ def honesty_rows(seeds: int, duration: float) -> list[AnyRow]:
             for scale, found in positions.items():
                 done = run(recording, EstimatorSettings(association=GIVEN, covariance_scale=scale))
                 found.append(position_nees_at_the_end(done))
-                quadrics += quadric_nees(done) if scale == 1.0 else []
+                if scale == 1.0:
+                    quadrics += quadric_nees(done)
+                    for span, nees in done.motion_nees().items():
+                        motions.setdefault(span, []).append(nees)
                 progress.step()
     low, high = nees_interval(3, seeds)
     rows: list[AnyRow] = [
@@ -71,6 +75,16 @@ def honesty_rows(seeds: int, duration: float) -> list[AnyRow]:
             note="last pose of each run; 3 is honest",
         )
         for scale, found in positions.items()
+    ]
+    rows += [
+        Within(
+            f"simulation, {seeds} seeds: NEES of motions over {span} keyframes",
+            float(np.mean(found)),
+            2.8,
+            3.2,
+            note=f"+- {np.std(found) / np.sqrt(len(found)):.2f}; 3 is honest",
+        )
+        for span, found in motions.items()
     ]
     covered = float(np.mean(np.array(quadrics) < stats.chi2.ppf(COVERAGE, 9)))
     note = f"{len(quadrics)} quadrics, (t, L) in their {COVERAGE:.0%} region; wished, not demanded"
