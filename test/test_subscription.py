@@ -13,7 +13,7 @@ from calibslam_msgs_py.message_types import RosTypes
 from calibslam_msgs_py.node import IMAGES, MEASUREMENT_INPUT, Counters
 from calibslam_msgs_py.node_subscription import Subscription
 
-COUNT = 20
+COUNT = 10  # as many as there is room for
 
 
 @pytest.mark.parametrize("reliability", [ReliabilityPolicy.RELIABLE, ReliabilityPolicy.BEST_EFFORT])
@@ -33,13 +33,14 @@ def test_as_reliable_as_the_publisher(profile: QoSProfile, reliability: Reliabil
 
         wait_until(lambda: matched() and publisher.get_subscription_count() == 1, "they do not connect")
         time.sleep(1.0)  # that one side has found the other does not tell that the other has
-        message = Image(height=480, width=640, encoding="rgb8", step=1920, data=RosTypes().octets(bytes(480 * 1920)))
+        reliable = reliability == ReliabilityPolicy.RELIABLE
+        # Best effort loses most of what is larger than a transport's buffers.
+        height, width = (480, 640) if reliable else (4, 4)
+        data = RosTypes().octets(bytes(3 * height * width))
+        message = Image(height=height, width=width, encoding="rgb8", step=3 * width, data=data)
         for k in range(COUNT):
             message.header.stamp.sec = k
             publisher.publish(message)
             time.sleep(0.05)
-        if reliability == ReliabilityPolicy.RELIABLE:
-            wait_until(lambda: len(received) == COUNT, lambda: f"{received}")
-        else:
-            assert received == sorted(set(received))  # some, in order
-        assert matched()
+        wait_until(lambda: len(received) == COUNT if reliable else received, lambda: f"{received}")
+        assert received == sorted(set(received)) and matched()

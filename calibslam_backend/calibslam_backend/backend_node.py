@@ -105,7 +105,7 @@ class BackendNode(Node):
             (Kind.START, "initialpose", MEASUREMENT_INPUT),
         ):
             # As bytes: what cannot be decoded would otherwise end the node, and the journal takes them as they are.
-            receive, follows = self._receiver(kind, topic), profile is not SENSOR
+            receive, follows = self._receiver(kind, topic), kind != Kind.CAMERA  # that is said once in some bags
             Subscription(self, self._counters, TYPES[kind], topic, receive, profile, raw=True, follows=follows)
         self._map_services = MapServices(
             self, self._session, Path(settings.map_folder), estimator_settings.start_in_map

@@ -260,11 +260,14 @@ def test_steps_with_nothing_to_learn_from_are_told_apart_and_evaluated(tmp_path:
         list(module.parameters()),
         lambda step: {"loss": module.weight.square().sum()} if step < 3 else None,
         torch.device("cpu"),
-        "with more boxes",
+        "begin in another folder with more boxes",
         held_out=held_out,
     )
     settings = LoopSettings(steps=60, evaluate_every=2, log_every=2)
-    with pytest.raises(TrainingError, match=r"^nothing to learn from in 20 steps up to step 22; begin again with more"):
+    with pytest.raises(
+        TrainingError,
+        match=r"^nothing to learn from in 20 steps up to step 22; begin in another folder with more boxes$",
+    ):
         optimise(task, settings, tmp_path, {}, resume=False)
     assert [row["step"] for row in rows(tmp_path)] == ["0", "2"]
     assert len(evaluated) == 11  # steps 0, 2 ... 20

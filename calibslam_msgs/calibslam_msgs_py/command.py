@@ -42,7 +42,7 @@ class ArgumentParser(argparse.ArgumentParser):
 
     def error(self, message: str) -> NoReturn:
         """Ends with exit code 2 and one line: the usage of a command with forty options would push it out of sight."""
-        self.exit(2, f"{self.prog}: error: {message}; see {self.prog} --help\n")
+        self.exit(2, f"{self.prog}: error: {message} (--help tells all options)\n")
 
 
 def command(main: Callable[Arguments, int]) -> Callable[Arguments, int]:

@@ -9,16 +9,16 @@ from typing import Any
 from rclpy.clock import Clock, ClockType
 from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.node import Node
-from rclpy.qos import QoSPolicyKind, QoSProfile, ReliabilityPolicy
+from rclpy.qos import DurabilityPolicy, QoSPolicyKind, QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import QoSOverridingOptions
 
 from calibslam_msgs_py.node import QOS_OVERRIDES, Counters
 
 LOOK_PERIOD = 0.5  # [s] of wall time between two looks at the publishers
-# Once reliability is what the publishers offer, it is no parameter any more.
-OTHER_OVERRIDES = QoSOverridingOptions(
-    [kind for kind in QOS_OVERRIDES.policy_kinds if kind != QoSPolicyKind.RELIABILITY]
-)
+# Once reliability is what the publishers offer, it is no parameter any more; and what they keep, which was delivered
+# before, is not asked for a second time.
+FOLLOWING = (QoSPolicyKind.RELIABILITY, QoSPolicyKind.DURABILITY)
+OTHER_OVERRIDES = QoSOverridingOptions([kind for kind in QOS_OVERRIDES.policy_kinds if kind not in FOLLOWING])
 
 
 class Subscription:
@@ -58,7 +58,8 @@ class Subscription:
         self._reliability = profile.reliability
         self._subscription = self._subscribe(QOS_OVERRIDES)
         chosen = f"qos_overrides.{self._subscription.topic_name}.subscription.reliability" in node._parameter_overrides
-        if follows and not chosen:
+        self._follows = follows and not chosen
+        if self._follows:
             self._timer = node.create_timer(LOOK_PERIOD, self._match, clock=Clock(clock_type=ClockType.STEADY_TIME))
 
     def _subscribe(self, overrides: QoSOverridingOptions) -> Any:
@@ -72,13 +73,20 @@ class Subscription:
             profile,
             raw=self._raw,
             qos_overriding_options=overrides,
-            event_callbacks=SubscriptionEventCallbacks(message_lost=self._lost),
+            event_callbacks=SubscriptionEventCallbacks(message_lost=self._lost, incompatible_qos=self._incompatible),
         )
 
     def _lost(self, info: Any) -> None:
         # What is best effort may lose what it likes.
         if self._profile.reliability == self._reliability == ReliabilityPolicy.RELIABLE:
             self._counters.count(f"lost_{self._topic}", info.total_count_change)
+
+    def _incompatible(self, info: Any) -> None:
+        if not self._follows:  # the others will match in a moment
+            policy = QoSPolicyKind(info.last_policy_kind).name.lower()
+            self._counters.warn(
+                f"a publisher of {self._topic} offers another {policy} and is not heard: see qos_overrides"
+            )
 
     def _match(self) -> None:
         offered = {
@@ -91,5 +99,7 @@ class Subscription:
         reliability = ReliabilityPolicy.BEST_EFFORT if best_effort else ReliabilityPolicy.RELIABLE
         if reliability != self._reliability:
             self._reliability = reliability
+            self._profile = copy(self._profile)
+            self._profile.durability = DurabilityPolicy.VOLATILE
             self._node.destroy_subscription(self._subscription)
             self._subscription = self._subscribe(OTHER_OVERRIDES)

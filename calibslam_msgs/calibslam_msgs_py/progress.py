@@ -53,6 +53,7 @@ class Progress:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         if self._line_open:
+            self._rewrite()
             self._stream.write("\n")
             self._stream.flush()
 
@@ -68,19 +69,25 @@ class Progress:
         if waited < SECONDS_BETWEEN_UPDATES or not self._is_shown:
             return
         share = self._share(done)
-        parts = [f"{self._what}: {share:4.0%}", self._left(now - self._began, share), self.note]
-        line = ", ".join(part for part in parts if part)
         if self._terminal:
-            self._stream.write(f"\r{line}\x1b[K")  # and nothing after it of a line that was longer
+            self._rewrite()
             self._line_open = True
         elif now - self._began < SECONDS_TO_JUDGE or (
             share - self._shown < SHARE_BETWEEN_LINES and waited < SECONDS_BETWEEN_LINES
         ):
             return
         else:
-            self._stream.write(f"{line}\n")
+            self._stream.write(f"{self._line()}\n")
         self._stream.flush()
         self._shown_at, self._shown = now, share
+
+    def _rewrite(self) -> None:
+        self._stream.write(f"\r{self._line()}\x1b[K")  # and nothing after it of a line that was longer
+
+    def _line(self) -> str:
+        share = self._share(self._done)
+        parts = [f"{self._what}: {share:4.0%}", self._left(time.monotonic() - self._began, share), self.note]
+        return ", ".join(part for part in parts if part)
 
     def _share(self, done: float) -> float:
         return min(done / self._total, 1.0) if self._total > 0.0 else 1.0

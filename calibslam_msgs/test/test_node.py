@@ -195,8 +195,10 @@ def test_what_is_usually_left_out_is_no_reason_to_warn(nodes: tuple[Node, Node, 
     assert {v.key: v.value for v in status.values}["rejected_double_box"] == "3"
 
 
-def test_who_asks_for_a_reliability_has_it(nodes: tuple[Node, Node, SingleThreadedExecutor]) -> None:
-    """Otherwise it is that of the publishers."""
+def test_who_asks_for_a_reliability_has_it(
+    nodes: tuple[Node, Node, SingleThreadedExecutor], capfd: pytest.CaptureFixture[str]
+) -> None:
+    """And is told where it connects to nobody. Otherwise it is that of the publishers."""
     _, other, executor = nodes
     name = "qos_overrides./asked.subscription.reliability"
     node = Node("overridden", context=other.context, parameter_overrides=[Parameter(name, value="reliable")])
@@ -211,6 +213,15 @@ def test_who_asks_for_a_reliability_has_it(nodes: tuple[Node, Node, SingleThread
 
     spin_until(executor, lambda: reliability("free") == ReliabilityPolicy.BEST_EFFORT)
     assert reliability("asked") == ReliabilityPolicy.RELIABLE
+    said = ""
+
+    def told() -> bool:
+        nonlocal said
+        said += capfd.readouterr().err
+        return "a publisher of asked offers another reliability and is not heard" in said
+
+    spin_until(executor, told)
+    assert "a publisher of free" not in said and "New publisher discovered" not in said
     executor.remove_node(node)
     node.destroy_node()
 

@@ -44,9 +44,18 @@ def test_a_short_job_shows_nothing(clock: Clock) -> None:
 
 def test_on_a_terminal_one_line_is_rewritten(clock: Clock) -> None:
     rest = "\x1b[K"
-    assert work(Terminal(), clock, 4, 8.0) == (
-        f"\rwork:  25%{rest}\rwork:  50%, 16 s left{rest}\rwork:  75%, 8 s left{rest}\rwork: 100%{rest}\n"
-    )
+    lines = ["work:  25%", "work:  50%, 16 s left", "work:  75%, 8 s left", "work: 100%", "work: 100%"]
+    assert work(Terminal(), clock, 4, 8.0) == "".join(f"\r{line}{rest}" for line in lines) + "\n"
+
+
+def test_the_last_state_is_shown(clock: Clock) -> None:
+    """Also of steps that follow one another too fast to be shown."""
+    with Progress(10, "work", stream=(stream := Terminal())) as shown:
+        clock.now += 1.0
+        for _ in range(10):
+            shown.step()
+            clock.now += 0.01
+    assert stream.getvalue() == "\rwork:  10%\x1b[K\rwork: 100%\x1b[K\n"
 
 
 def test_a_job_that_is_gone_on_with_is_judged_by_what_was_done_now(clock: Clock) -> None:
@@ -55,7 +64,7 @@ def test_a_job_that_is_gone_on_with_is_judged_by_what_was_done_now(clock: Clock)
         clock.now += 20.0
         shown.note = "loss 0.5"
         shown.at(60.0)
-    assert stream.getvalue() == "\rwork:  60%, 80 s left, loss 0.5\x1b[K\n"
+    assert stream.getvalue() == 2 * "\rwork:  60%, 80 s left, loss 0.5\x1b[K" + "\n"
 
 
 def test_a_job_is_shown_only_if_it_is_to_be(clock: Clock) -> None:

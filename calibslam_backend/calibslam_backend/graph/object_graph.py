@@ -160,9 +160,9 @@ class ObjectGraph:
         return np.asarray(own + by_frame @ self.frame @ by_frame.T)
 
     def motion_covariance(self, first: int, last: int) -> Array:
-        """(6, 6) [rotation, translation] of the motion between two keyframes, in the body at its end; the tree's own.
+        """(6, 6) [rotation, translation] of the motion between two keyframes, in the camera frame of the last one.
 
-        What is not known of the whole map takes no part in it.
+        By the tree's own, as all gates. What is not known of the whole map takes no part in it.
         """
         joint = self._smoother.joint([x(first), x(last)])
         both = np.block([[joint.at(a, b) for b in (x(first), x(last))] for a in (x(first), x(last))])

@@ -47,7 +47,7 @@ class Tally:
         for name, count in (self._counts - self._told).items():
             if name in LEFT_OUT:
                 reason = name.removeprefix("rejected_")
-                self._report.reject(InvalidMeasurement(reason, f"{count} {LEFT_OUT[name]}"), count)
+                self._report.reject(InvalidMeasurement(reason, LEFT_OUT[name]), count)
             else:
                 self._report.count(name, count)
         self._told = self._counts.copy()

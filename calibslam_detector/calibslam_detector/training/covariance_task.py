@@ -163,7 +163,10 @@ def covariance_task(
         head.train()
         return float(sum(found.values()))
 
-    way_out = "with more --regions (a step has too few boxes of objects wholly in the image), or with --loss nll"
+    way_out = (
+        "a step has too few boxes of objects wholly in the image: begin in another folder with more --regions, or with "
+        "--loss nll"
+    )
     return Task(head, list(head.parameters()), losses, device, way_out, held_out=held_out)
 
 

@@ -90,7 +90,7 @@ def detector_task(
         parameters=parameters,
         losses=losses,
         device=processes.device,
-        way_out="with images that can be read",
+        way_out="begin in another folder with images that can be read",
         everywhere=processes.everywhere,
         is_first=processes.rank == 0,
     )

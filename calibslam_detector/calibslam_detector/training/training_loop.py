@@ -25,7 +25,7 @@ from calibslam_msgs_py.progress import Progress
 from calibslam_msgs_py.settings import Settings, setting
 
 MAX_GRADIENT = 10.0  # norm to which a gradient is cut
-MAX_SKIPPED = 20  # steps without a finite loss in a row
+MAX_SKIPPED = 20  # steps in a row that have taught nothing
 
 
 class Interrupted(Exception):
@@ -62,7 +62,7 @@ class Task:
         module: whose weights and numbers a checkpoint holds.
         parameters: that are changed.
         losses: names and values at a step; their sum is made smaller. None: nothing to learn from this step.
-        way_out: what to do where steps have nothing to learn from.
+        way_out: what to do where steps have nothing to learn from, as an imperative.
         everywhere: whether what is so here is so in all processes, e.g. that a loss is finite.
         is_first: whether this process writes files and shows progress.
         held_out: a loss on samples that are not learnt from. It is told with each line of the log, and in the end the
@@ -73,7 +73,7 @@ class Task:
     parameters: list[nn.Parameter]
     losses: Callable[[int], dict[str, Tensor] | None]
     device: torch.device
-    way_out: str = ""
+    way_out: str = "give more to learn from"
     everywhere: Callable[[bool], bool] = bool
     is_first: bool = True
     held_out: Callable[[], float] | None = None
@@ -105,7 +105,8 @@ def optimise(task: Task, settings: LoopSettings, folder: Path, identity: dict[st
                 losses = descent.step(step)
             except StepsInVain as error:
                 begin = f"go on from {checkpoint.path} (--resume)" if checkpoint.path.exists() else "begin again"
-                raise TrainingError(f"{error.what} up to step {step}; {begin} {error.way_out}") from None
+                way_out = error.way_out or f"{begin} with a smaller --learning-rate"
+                raise TrainingError(f"{error.what} up to step {step}; {way_out}") from None
             is_logged = log is not None and step % settings.log_every == 0
             is_evaluated = step % settings.evaluate_every == 0
             held_out = task.held_out() if task.held_out is not None and (is_logged or is_evaluated) else None
@@ -169,7 +170,7 @@ class Descent:
         if losses is None:
             return self._skip("nothing to learn from", self._task.way_out)
         if not self._task.everywhere(bool(torch.isfinite(total))):
-            return self._skip("no finite loss", "with a smaller --learning-rate")
+            return self._skip("no finite loss")
         self.in_vain = 0
         self.scaler.scale(total).backward()
         self.scaler.unscale_(self.optimiser)
@@ -178,7 +179,7 @@ class Descent:
         self.scaler.update()
         return {name: float(value.detach()) for name, value in losses.items()}
 
-    def _skip(self, what: str, way_out: str) -> dict[str, float]:
+    def _skip(self, what: str, way_out: str = "") -> dict[str, float]:
         self.in_vain += 1
         if self.in_vain >= MAX_SKIPPED:
             raise StepsInVain(f"{what} in {self.in_vain} steps", way_out)

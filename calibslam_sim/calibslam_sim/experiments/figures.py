@@ -122,7 +122,10 @@ def condition_figure(
         panel.grid(alpha=0.3)
     for panel in axes.flat[len(metrics) :]:
         panel.set_axis_off()
-    figure.suptitle(f"{title}\n{result['repetitions']} repetitions (|); mean and its 95 % interval (•)", fontsize=11)
+    figure.suptitle(
+        f"{title}\n{result['repetitions']} repetitions (|); mean and its 95 % interval (•), cut where panels end",
+        fontsize=11,
+    )
     figure.tight_layout()
     figure.savefig(path)
     plt.close(figure)
