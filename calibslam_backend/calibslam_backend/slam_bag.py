@@ -166,6 +166,8 @@ def slam_bag(
     record.topics = recording.topics
     record.calibrator = None if calibrator is None else str(Path(calibrator).resolve())
     truth, objects = recording.ground_truth(), recording.true_objects() or ()
+    if truth is not None:  # nothing else to compare them with, and they take time
+        record.motions = estimator.motion_covariances()
     return write_run(out, Path(bag).name, estimator.object_map(), record, truth, objects)
 
 
@@ -191,7 +193,6 @@ def run_record(
     }
     return RunRecord(
         odometry=estimator.odometry(),
-        motions=estimator.motion_covariances(),
         online=Trajectory(
             np.array([keyframe.stamp for keyframe in keyframes]),
             np.reshape([keyframe.T_map_camera for keyframe in keyframes], (-1, 4, 4)),

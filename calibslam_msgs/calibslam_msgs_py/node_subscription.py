@@ -54,8 +54,8 @@ class Subscription:
         follows: bool = True,
     ) -> None:
         self._node, self._counters, self._kind, self._topic = node, counters, kind, topic
-        self._receive, self._profile, self._raw = receive, profile, raw
-        self._reliability = profile.reliability
+        self._receive, self._raw = receive, raw
+        self._meant, self._profile = profile.reliability, copy(profile)
         self._subscription = self._subscribe(QOS_OVERRIDES)
         chosen = f"qos_overrides.{self._subscription.topic_name}.subscription.reliability" in node._parameter_overrides
         self._follows = follows and not chosen
@@ -63,14 +63,11 @@ class Subscription:
             self._timer = node.create_timer(LOOK_PERIOD, self._match, clock=Clock(clock_type=ClockType.STEADY_TIME))
 
     def _subscribe(self, overrides: QoSOverridingOptions) -> Any:
-        # A copy: rclpy writes the overrides into the profile itself.
-        profile = copy(self._profile)
-        profile.reliability = self._reliability
         return self._node.create_subscription(
             self._kind,
             self._topic,
             self._receive,
-            profile,
+            copy(self._profile),  # rclpy writes the overrides into the profile itself
             raw=self._raw,
             qos_overriding_options=overrides,
             event_callbacks=SubscriptionEventCallbacks(message_lost=self._lost, incompatible_qos=self._incompatible),
@@ -78,7 +75,7 @@ class Subscription:
 
     def _lost(self, info: Any) -> None:
         # What is best effort may lose what it likes.
-        if self._profile.reliability == self._reliability == ReliabilityPolicy.RELIABLE:
+        if self._meant == self._profile.reliability == ReliabilityPolicy.RELIABLE:
             self._counters.count(f"lost_{self._topic}", info.total_count_change)
 
     def _incompatible(self, info: Any) -> None:
@@ -97,9 +94,8 @@ class Subscription:
             return
         best_effort = ReliabilityPolicy.BEST_EFFORT in offered
         reliability = ReliabilityPolicy.BEST_EFFORT if best_effort else ReliabilityPolicy.RELIABLE
-        if reliability != self._reliability:
-            self._reliability = reliability
-            self._profile = copy(self._profile)
+        if reliability != self._profile.reliability:
+            self._profile.reliability = reliability
             self._profile.durability = DurabilityPolicy.VOLATILE
             self._node.destroy_subscription(self._subscription)
             self._subscription = self._subscribe(OTHER_OVERRIDES)

@@ -164,11 +164,11 @@ class ObjectGraph:
 
         By the tree's own, as all gates. What is not known of the whole map takes no part in it.
         """
-        joint = self._smoother.joint([x(first), x(last)])
-        both = np.block([[joint.at(a, b) for b in (x(first), x(last))] for a in (x(first), x(last))])
+        both = (x(first), x(last))
+        joint = _together(self._smoother.joint([*both]), both)
         undone = gtsam.Pose3(self.pose(last)).between(gtsam.Pose3(self.pose(first)))
         A = np.hstack([-undone.AdjointMap(), np.eye(6)])
-        return np.asarray(A @ both @ A.T)
+        return np.asarray(A @ joint @ A.T)
 
     def distance(self, k: int, T_map_camera: Array) -> float:
         """Mahalanobis distance of keyframe k from where it is estimated to be, if it were at this pose (4, 4); by the
@@ -209,8 +209,7 @@ class ObjectGraph:
         if not quadrics:
             return {}
         joint = self._smoother.joint([x(k), *map(q, quadrics)])
-        pairs = {j: (x(k), q(j)) for j in quadrics}
-        return {j: np.block([[joint.at(a, b) for b in pair] for a in pair]) for j, pair in pairs.items()}
+        return {j: _together(joint, (x(k), q(j))) for j in quadrics}
 
     # -- changes, which take effect with the next update --------------------------------------------------------
 
@@ -483,6 +482,11 @@ class ObjectGraph:
                 log.warning("%s; giving up quadric %d", _first_sentence(error), youngest)
                 self.remove_quadric(youngest)
                 before.erase(q(youngest))
+
+
+def _together(joint: gtsam.JointMarginal, keys: tuple[int, ...]) -> Array:
+    """The covariance of some variables, in this order."""
+    return np.block([[joint.at(a, b) for b in keys] for a in keys])
 
 
 def _first_sentence(error: RuntimeError) -> str:

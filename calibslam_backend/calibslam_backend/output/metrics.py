@@ -157,8 +157,7 @@ def position_nees(estimate: Trajectory, covariances: Array, truth: Trajectory) -
     errors = poses[:, :3, 3] - (poses[0] @ np.linalg.inv(true[0]) @ true)[:, :3, 3]
     R = poses[:, :3, :3]
     in_map = R @ covariances[:, 3:, 3:] @ R.transpose(0, 2, 1)
-    squared = np.einsum("ni,ni->n", errors[1:], np.linalg.solve(in_map[1:], errors[1:, :, None])[:, :, 0])
-    return float(squared.mean())
+    return float(_normalised(errors[1:], in_map[1:]).mean())
 
 
 def motion_nees(estimate: Trajectory, motions: MotionCovariances, truth: Trajectory) -> dict[int, float]:
@@ -183,9 +182,13 @@ def motion_nees(estimate: Trajectory, motions: MotionCovariances, truth: Traject
     truly = np.linalg.inv(true[first]) @ true[last]
     # In the frame of the last pose, as the covariances are.
     errors = np.einsum("nji,nj->ni", estimated[:, :3, :3], (estimated - truly)[:, :3, 3])
-    covariances = motions.covariances[counts][:, 3:, 3:]
-    squared = np.einsum("ni,ni->n", errors, np.linalg.solve(covariances, errors[:, :, None])[:, :, 0])
+    squared = _normalised(errors, motions.covariances[counts][:, 3:, 3:])
     return {int(n): float(squared[spans[counts] == n].mean()) for n in np.unique(spans[counts])}
+
+
+def _normalised(errors: Array, covariances: Array) -> Array:
+    """(N,) errors (N, d) squared over their covariances (N, d, d)."""
+    return np.asarray(np.einsum("ni,ni->n", errors, np.linalg.solve(covariances, errors[:, :, None])[:, :, 0]))
 
 
 @dataclass(frozen=True)

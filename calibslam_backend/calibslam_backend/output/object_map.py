@@ -68,7 +68,7 @@ class ObjectMap:
     prior: MapPrior = NOTHING_KNOWN
 
     def save(self, path: Path) -> None:
-        """Write it as JSON; the same map gives the same bytes. An existing file is replaced in one step."""
+        """Write it as JSON, and its folder; the same map gives the same bytes. A file is replaced in one step."""
         write_whole(path, self.to_json().encode())
 
     def to_json(self) -> str:

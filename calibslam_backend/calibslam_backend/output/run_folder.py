@@ -33,7 +33,6 @@ class RunRecord:
 
     Attributes:
         odometry: poses (N, 4, 4) of the keyframes by odometry alone, and covariances (N, 6, 6).
-        motions: what is known of those between keyframes.
         online: each keyframe as known right after it; without those in which the estimator failed.
         seconds: each keyframe's update.
         between: the longest that an image since the keyframe before took.
@@ -48,10 +47,10 @@ class RunRecord:
         topics: its topics that were used, as `Recording` has them.
         calibrator: file that gave boxes their covariances; None: the default, or the boxes had them.
         settings: that were used, for the record.
+        motions: what is known of those between keyframes; None: not asked for.
     """
 
     odometry: tuple[Array, Array]
-    motions: MotionCovariances
     online: Trajectory
     seconds: Array
     between: Array
@@ -68,6 +67,7 @@ class RunRecord:
     topics: dict[str, str] = field(default_factory=dict)
     calibrator: str | None = None
     settings: dict[str, Any] = field(default_factory=dict)
+    motions: MotionCovariances | None = None
 
 
 def accuracy(
@@ -86,10 +86,10 @@ def accuracy(
 
 
 def honesty_of_motions(
-    result: ObjectMap, motions: MotionCovariances, truth: Trajectory | None
+    result: ObjectMap, motions: MotionCovariances | None, truth: Trajectory | None
 ) -> dict[str, float] | None:
     """NEES of motions by how many keyframes they span, as an entry of metrics.json; None without ground truth."""
-    if truth is None:
+    if truth is None or motions is None:
         return None
     found = motion_nees(Trajectory(np.array(result.stamps), result.poses), motions, truth)
     return {str(span): nees for span, nees in found.items()} or None

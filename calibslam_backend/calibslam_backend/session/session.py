@@ -325,7 +325,6 @@ class Session:
             left = len(self.intake)
             if not left:
                 self._refine()
-            path.parent.mkdir(parents=True, exist_ok=True)
             self.estimator.object_map().save(path)
             text = f"{self.estimator.objects} objects and {len(self.estimator.stamps)} keyframes in {path}"
             return text + (f"; {left} measurements had not been used yet" if left else "")

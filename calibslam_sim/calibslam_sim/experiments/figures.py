@@ -104,15 +104,15 @@ def condition_figure(
     figure, axes = plt.subplots(rows, columns, figsize=(4.6 * columns, height * rows), squeeze=False, dpi=110)
     places = np.arange(len(conditions))[::-1]
     for i, (metric, named) in enumerate(metrics.items()):
-        panel = axes.flat[i]
+        panel, every = axes.flat[i], np.zeros(0)
         for place, condition in zip(places, conditions, strict=True):
             found = result["conditions"][condition][metric]
             values = defined(found["values"])
+            every = np.append(every, values)
             panel.plot(values, np.full(len(values), place + 0.15), "|", color="0.5", markersize=7)
             if len(values):
                 half = half_interval(values, result.get("left_out", {}).get(condition, 0.0))
                 panel.errorbar(found["mean"], place - 0.1, xerr=half, fmt="o", color="black", capsize=4)
-        every = np.concatenate([defined(result["conditions"][condition][metric]["values"]) for condition in conditions])
         if len(every) and np.ptp(every) > 0.0:
             panel.set_xlim(every.min() - 0.05 * np.ptp(every), every.max() + 0.05 * np.ptp(every))
         panel.set_yticks(places, conditions if i % columns == 0 else [""] * len(conditions))
