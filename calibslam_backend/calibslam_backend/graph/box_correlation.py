@@ -22,9 +22,10 @@ So each box counts with the share w = 1 / s(u) of its log-likelihood, at most fu
 1 / s(0), what the mean over a long time is worth ((1 - m) / (1 + m) for a = 1; Bayley and Hammersley 1946); where it is
 so bad that boxes must tell each motion, an error that stays the same does no harm to that, and they count fully.
 
-What has added up since the beginning is slow, and of that a graph with these weights states too little: boxes of the
-level s(0) instead of 1 / w leave a random walk that they tie down with sqrt(w s(0)) times the variance (it is the
-geometric mean of the variances of a step and of what ties it, in the steady state and for small Q I).
+What is slower than that is stated too small by a graph with these weights: boxes of the level s(u) instead of 1 / w
+leave a random walk that they tie down with sqrt(w s(u)) times the variance (it is the geometric mean of the variances
+of a step and of what ties it, in the steady state and for small Q I). A motion over n keyframes is of the frequency
+pi / n, and what has added up since the beginning of frequency 0.
 
 All three are estimated while the graph grows: a and m from its residuals, those of doubted boxes reduced as they are
 there, and Q I, a mean over the six directions of motion and over keyframes.
@@ -75,7 +76,6 @@ class BoxCorrelation:
 
     Attributes:
         worth: the share w of a box's log-likelihood that counts, at most 1.
-        understated: factor by which the covariances of a graph with these weights are too small, at least 1.
     """
 
     MEMORY = 3000.0  # pairs; earlier ones, of an estimate that was worse, fade
@@ -90,7 +90,8 @@ class BoxCorrelation:
         self._products = dict.fromkeys(LAGS, 0.0)
         self._squares = dict.fromkeys(LAGS, 0.0)
         self._told, self._keyframes = 0.0, self.BEFORE
-        self.worth = self.understated = 1.0
+        self._slow = 0.0, 0.0
+        self.worth = 1.0
 
     def learn(self, before: Array, now: Array, lag: int = 1) -> None:
         """Residuals (N, 4) and (N, 4) of the same objects' boxes in keyframes `lag` apart, in standard deviations.
@@ -123,12 +124,16 @@ class BoxCorrelation:
         self._keyframes = fading * self._keyframes + 1.0
         self._weigh()
 
+    def understated(self, keyframes: float = np.inf) -> float:
+        """Factor by which a graph with these weights states the covariance of a motion over so many keyframes too
+        small, at least 1; by default that of a pose, or of a quadric."""
+        u = 2.0 - 2.0 * np.cos(np.pi / keyframes)
+        return max(float(np.sqrt(self.worth * spectrum(*self._slow, u))), 1.0)
+
     def _weigh(self) -> None:
-        self.worth = self.understated = 1.0
-        if self._is_estimated and self.correlation > 0.0:
-            share, memory = slow_part(self.correlation, self._correlation(2))
-            self.worth = min(1.0 / spectrum(share, memory, crossover(share, memory, self.ratio)), 1.0)
-            self.understated = float(np.sqrt(self.worth * spectrum(share, memory, 0.0)))
+        is_alike = self._is_estimated and self.correlation > 0.0
+        self._slow = slow_part(self.correlation, self._correlation(2)) if is_alike else (0.0, 0.0)
+        self.worth = min(1.0 / spectrum(*self._slow, crossover(*self._slow, self.ratio)), 1.0)
 
     @property
     def correlation(self) -> float:

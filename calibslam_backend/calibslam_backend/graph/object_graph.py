@@ -156,19 +156,19 @@ class ObjectGraph:
         """(6, 6) [rotation, translation] of keyframe k in its body, with what the tree understates of errors that are
         alike, and with what is not known of the whole map."""
         by_frame = gtsam.Pose3(self.pose(k)).inverse().AdjointMap()
-        own = self.correlation.understated * self._smoother.marginal(x(k))
+        own = self.correlation.understated() * self._smoother.marginal(x(k))
         return np.asarray(own + by_frame @ self.frame @ by_frame.T)
 
     def motion_covariance(self, first: int, last: int) -> Array:
         """(6, 6) [rotation, translation] of the motion between two keyframes, in the camera frame of the last one.
 
-        By the tree's own, as all gates. What is not known of the whole map takes no part in it.
+        With what the tree understates of it, as poses; what is not known of the whole map takes no part in it.
         """
         both = (x(first), x(last))
         joint = _together(self._smoother.joint([*both]), both)
         undone = gtsam.Pose3(self.pose(last)).between(gtsam.Pose3(self.pose(first)))
         A = np.hstack([-undone.AdjointMap(), np.eye(6)])
-        return np.asarray(A @ joint @ A.T)
+        return np.asarray(self.correlation.understated(last - first) * A @ joint @ A.T)
 
     def distance(self, k: int, T_map_camera: Array) -> float:
         """Mahalanobis distance of keyframe k from where it is estimated to be, if it were at this pose (4, 4); by the
@@ -182,7 +182,7 @@ class ObjectGraph:
         solved = [j for j in self.landmarks if self.is_solved(j)]
         for some in (solved[n : n + self.AT_ONCE] for n in range(0, len(solved), self.AT_ONCE)):
             joint = self._smoother.joint([q(j) for j in some])
-            own.update({j: self.correlation.understated * joint.at(q(j), q(j)) for j in some})
+            own.update({j: self.correlation.understated() * joint.at(q(j), q(j)) for j in some})
         by_frame = {j: moved_with_map(self.quadric(j)) for j in own}
         return {j: own[j] + G @ self.frame @ G.T for j, G in by_frame.items()}
 
@@ -193,7 +193,7 @@ class ObjectGraph:
         if not solved:
             return MapPrior(self.frame, new)
         joint = self._smoother.joint([q(j) for j in solved])
-        blocks = self.correlation.understated * np.array([[joint.at(q(i), q(j)) for j in solved] for i in solved])
+        blocks = self.correlation.understated() * np.array([[joint.at(q(i), q(j)) for j in solved] for i in solved])
         vectors = [self.quadric(j) for j in solved]
         try:
             found = prior_of(solved, vectors, blocks)
