@@ -32,6 +32,7 @@ from calibslam_backend.graph.known import Known
 from calibslam_backend.graph.measured import Motion
 from calibslam_backend.graph.noise import QUADRICSLAM
 from calibslam_backend.graph.object_graph import ObjectGraph, UpdateReport
+from calibslam_backend.graph.published import PublishedCovariances
 from calibslam_backend.kernels import load_kernels
 from calibslam_backend.keyframe import Keyframe
 from calibslam_backend.objects.new_quadrics import NewQuadrics
@@ -75,6 +76,7 @@ class Estimator:
         self._motions = MotionChain(self.settings, self._T_body_camera)
         self._tracker = Tracker(self.settings, self.camera.K)
         self._graph = ObjectGraph(self.camera.K, self.settings, self.settings, self.settings)
+        self._covariances = PublishedCovariances(self._graph)
         self._assignments = Assignments(self._graph)
         self._objects = DataAssociation(self._assignments, self.camera, self.settings, self.counts)
         self._new = NewQuadrics(self._assignments, self.camera, self.settings, self._objects.bind, self.counts)
@@ -165,7 +167,7 @@ class Estimator:
 
     def pose_covariance(self, index: int) -> Array:
         """(6, 6) [rotation, translation] of a keyframe in its camera frame."""
-        return self._graph.pose_covariance(index)
+        return self._covariances.pose(index)
 
     def motion_covariances(self) -> MotionCovariances:
         """Of motions over as many keyframes as `SPANS` says, of each at most `MOTIONS` that are evenly spread."""
@@ -177,7 +179,7 @@ class Estimator:
             for first in np.unique(np.linspace(0, count - span - 1, self.MOTIONS).astype(int)).tolist()
         ]
         first, last = np.array(pairs, dtype=int).reshape(-1, 2).T
-        covariances = [self._graph.motion_covariance(*pair) for pair in pairs]
+        covariances = [self._covariances.motion(*pair) for pair in pairs]
         return MotionCovariances(first, last, np.reshape(covariances, (-1, 6, 6)))
 
     def object_map(self) -> ObjectMap:
@@ -190,13 +192,13 @@ class Estimator:
             np.reshape(covariances, (-1, 6, 6)),
             self.quadrics(),
             self.camera.frame_id,
-            self._graph.known(),
+            self._covariances.known(),
         )
 
     def quadrics(self) -> tuple[QuadricEstimate, ...]:
         """The map."""
         result = []
-        for j, covariance in self._graph.quadric_covariances().items():
+        for j, covariance in self._covariances.quadrics().items():
             vector = self._graph.quadric(j)
             ellipsoid = Ellipsoid.from_vector(vector)
             result.append(
@@ -259,7 +261,7 @@ class Estimator:
     def begin_again(self, keep_map: bool) -> None:
         """Forget the trajectory, and the objects unless the map is kept: then as in a loaded map."""
         no_poses = (), np.zeros((0, 4, 4)), np.zeros((0, 6, 6))
-        known = (self.quadrics(), self.camera.frame_id, self._graph.known()) if keep_map else ((),)
+        known = (self.quadrics(), self.camera.frame_id, self._covariances.known()) if keep_map else ((),)
         self.load(ObjectMap(*no_poses, *known))
 
     def start_at(self, T_map_body: Array, error: float = START_ERROR) -> None:

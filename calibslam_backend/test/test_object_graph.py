@@ -11,10 +11,11 @@ from calibslam_backend.estimator_settings import EstimatorSettings
 from calibslam_backend.geometry.box_measurement import BoxMeasurement
 from calibslam_backend.geometry.ellipsoid import Ellipsoid
 from calibslam_backend.geometry.visible_box import ALL_EDGES, box_of_visible_part, image_bounds
-from calibslam_backend.graph import object_graph
+from calibslam_backend.graph import published as published_module
 from calibslam_backend.graph.known import Known, MapPrior, moved_with_map, prior_of
 from calibslam_backend.graph.measured import Motion
 from calibslam_backend.graph.object_graph import T_MAP_FIRST_CAMERA, ObjectGraph
+from calibslam_backend.graph.published import PublishedCovariances
 from calibslam_backend.kernels import load_kernels
 from calibslam_msgs_py.measurements import Array
 
@@ -72,11 +73,12 @@ def test_motions_are_as_uncertain_as_odometry_where_nothing_else_is_known() -> N
     for step in steps:
         graph.add_pose(step, graph.predict(step))
     graph.update()
-    np.testing.assert_allclose(graph.motion_covariance(0, 1), steps[0].covariance, rtol=1e-6, atol=1e-9)
-    np.testing.assert_allclose(graph.motion_covariance(1, 2), steps[1].covariance, rtol=1e-6, atol=1e-9)
+    published = PublishedCovariances(graph)
+    np.testing.assert_allclose(published.motion(0, 1), steps[0].covariance, rtol=1e-6, atol=1e-9)
+    np.testing.assert_allclose(published.motion(1, 2), steps[1].covariance, rtol=1e-6, atol=1e-9)
     undone = gtsam.Pose3(steps[1].T).inverse().AdjointMap()
     expected = undone @ steps[0].covariance @ undone.T + steps[1].covariance
-    np.testing.assert_allclose(graph.motion_covariance(0, 2), expected, rtol=1e-6, atol=1e-9)
+    np.testing.assert_allclose(published.motion(0, 2), expected, rtol=1e-6, atol=1e-9)
 
 
 def test_what_an_iteration_moves_is_linearised_anew() -> None:
@@ -134,10 +136,11 @@ def test_a_camera_at_the_origin_tells_where_the_map_is() -> None:
     for _ in range(3):
         graph.iterate()
     np.testing.assert_allclose(graph.pose(0), T_MAP_FIRST_CAMERA, atol=2e-3)
-    assert not graph.frame.any() and np.sqrt(np.diag(graph.pose_covariance(0))).max() < 2e-3
-    for j, vector in true.items():
-        error = vector - graph.quadric(j)
-        assert error @ np.linalg.solve(graph.quadric_covariances()[j], error) < 9.0
+    published = PublishedCovariances(graph)
+    assert not graph.frame.any() and np.sqrt(np.diag(published.pose(0))).max() < 2e-3
+    for j, covariance in published.quadrics().items():
+        error = true[j] - graph.quadric(j)
+        assert error @ np.linalg.solve(covariance, error) < 9.0
 
 
 def test_without_the_quadric_that_others_depend_on() -> None:
@@ -146,16 +149,17 @@ def test_without_the_quadric_that_others_depend_on() -> None:
     graph.add_origin(T_MAP_FIRST_CAMERA)
     graph.update()
     root = next(j for j, known in prior.quadrics.items() if known.parent is None)
-    before = graph.quadric_covariances()
+    published = PublishedCovariances(graph)
+    before = published.quadrics()
     graph.remove_quadric(root)
     children = [j for j, known in prior.quadrics.items() if known.parent == root]
     assert children and all(graph.is_solved(j) for j in children)
-    assert graph.known().quadrics.keys() == before.keys() - {root}
+    assert published.known().quadrics.keys() == before.keys() - {root}
     graph.update()
-    after = graph.quadric_covariances()
+    after = published.quadrics()
     for j in children:
         np.testing.assert_allclose(after[j], before[j], atol=0.1 * np.abs(before[j]).max())
-    graph.known().check()
+    published.known().check()
 
 
 def test_a_map_whose_covariances_are_none_of_one_distribution_can_be_gone_on_with(
@@ -167,9 +171,10 @@ def test_a_map_whose_covariances_are_none_of_one_distribution_can_be_gone_on_wit
     graph, _ = known_map()
     graph.add_origin(T_MAP_FIRST_CAMERA)
     graph.update()
-    monkeypatch.setattr(object_graph, "prior_of", fails)
-    found = graph.known()
+    monkeypatch.setattr(published_module, "prior_of", fails)
+    published = PublishedCovariances(graph)
+    found = published.known()
     assert "is not kept: Singular matrix" in caplog.text
-    for j, covariance in graph.quadric_covariances().items():
+    for j, covariance in published.quadrics().items():
         assert found.quadrics[j].parent is None
         np.testing.assert_allclose(found.with_frame()[j].covariance, covariance)

@@ -92,9 +92,9 @@ def quadric_nees(done: Run) -> list[float]:
             boxes.setdefault(quadric, Counter())[name] += 1
     to_map = T_map_world(done)
     objects = {str(thing.id): thing.ellipsoid for thing in done.recording.world}
-    graph = done.estimator._graph  # the node publishes rotation and radii; the estimate is (t, L)
+    covariances, graph = done.estimator._covariances, done.estimator._graph  # of (t, L), not of rotation and radii
     result = []
-    for j, covariance in graph.quadric_covariances().items():
+    for j, covariance in covariances.quadrics().items():
         true = objects[boxes[j].most_common(1)[0][0]]
         error = graph.quadric(j) - Ellipsoid(to_map @ true.T_world_object, true.radii).vector()
         result.append(float(error @ np.linalg.solve(covariance, error)))

@@ -21,16 +21,17 @@ from calibslam_backend.graph.box_correlation import LAGS, BoxCorrelation
 from calibslam_backend.graph.box_factor import box_factor, box_tangents, pose_information
 from calibslam_backend.graph.found_factor import found_factor
 from calibslam_backend.graph.keys import D, poses_of, q, x
-from calibslam_backend.graph.known import Known, MapPrior, conditional_factor, moved_with_map, prior_of
+from calibslam_backend.graph.known import Known, MapPrior, conditional_factor
 from calibslam_backend.graph.measured import Landmark, Motion
 from calibslam_backend.graph.odometry_factor import DRIFT, motion_factor
 from calibslam_backend.graph.plausible import is_object, leapt
 from calibslam_backend.graph.prior import PriorSettings
+from calibslam_backend.graph.relinearisation import Relinearisation, RelinearisationSettings
 from calibslam_backend.graph.smoother import Smoother
 from calibslam_backend.odometry.motion_chain import dead_reckoning
 from calibslam_backend.odometry.motion_noise import MotionNoise
 from calibslam_msgs_py.measurements import Array
-from calibslam_msgs_py.settings import Settings, setting
+from calibslam_msgs_py.settings import setting
 
 log = logging.getLogger(__name__)
 
@@ -43,7 +44,7 @@ T_MAP_FIRST_CAMERA = np.array(
 
 
 @dataclass(frozen=True)
-class GraphSettings(Settings):
+class GraphSettings(RelinearisationSettings):
     robust_scale: float = setting(2.0, "Mahalanobis distance beyond which a box is doubted", low=0.1, high=1e6)
     box_correlation: bool = setting(
         True, "whether boxes count less where the errors of an object's boxes in consecutive keyframes are alike"
@@ -52,10 +53,6 @@ class GraphSettings(Settings):
     prior_sigma: float = setting(
         0.001, "of the first pose, which is the origin of the map: standard deviation", unit="rad and m", low=1e-6
     )
-    relinearised: int = setting(60, "earlier keyframes, with every second new one, that may be relinearised", low=1)
-    relinearise_pose: float = setting(0.02, "change of a pose that asks for one", unit="rad and m", low=0.0)
-    relinearise_quadric: float = setting(0.03, "change of a quadric that asks for one", unit="m and log m", low=0.0)
-    young: int = setting(20, "keyframes during which a quadric is relinearised at once", low=0)
 
 
 @dataclass(frozen=True)
@@ -73,7 +70,6 @@ class ObjectGraph:
     NEW_POSES = 5  # that are relinearised at once
     IN_SIGHT = 10  # keyframes for which a quadric that was seen counts as one that will be seen again soon
     FAR = 0.05  # [rad, m] that a pose may be from the base of its coordinates
-    WORTH_CHANGED = 0.1  # share by which a box's worth has to change for it to be relinearised
     AT_ONCE = 30  # quadrics whose covariances are computed together: one by one and all at once take longer
     FOUND_SIGMA = 0.5  # [rad, m] of a pose found in a known map: its boxes say it better
 
@@ -89,12 +85,11 @@ class ObjectGraph:
         self.correlation = BoxCorrelation(settings.box_correlation)
         self._origin, self._origin_sigma = T_MAP_FIRST_CAMERA, settings.prior_sigma
         thresholds = {"x": (6, self.FAR), "q": (9, np.inf), "d": (DRIFT, np.inf)}
-        self.frame = np.zeros((6, 6))  # covariance of a motion of the whole map, see `known`
+        self.frame = np.zeros((6, 6))  # covariance of a motion of the whole map, see `MapPrior`
         self._beside: int | None = None  # of which known quadric the first pose was found
         self._smoother = Smoother(thresholds, self._linearise_boxes)
-        self._linearised = np.zeros((0, 4, 4))  # of each pose where its factors were linearised
+        self._relinearisation = Relinearisation(settings)
         self._extracted = self._smoother.values, np.zeros((0, 4, 4))  # an estimate and its poses
-        self._next_turn = 0
 
     # -- what is in it ------------------------------------------------------------------------------------------
 
@@ -152,64 +147,42 @@ class ObjectGraph:
         """Whether a quadric has gone through an update, and so has covariances."""
         return self._smoother.is_solved(q(j))
 
+    # -- how sure it is, by the tree alone: for gates; what is published of it: see `published` ---------------------
+
     def pose_covariance(self, k: int) -> Array:
-        """(6, 6) [rotation, translation] of keyframe k in its body, with what the tree understates of errors that are
-        alike, and with what is not known of the whole map."""
-        by_frame = gtsam.Pose3(self.pose(k)).inverse().AdjointMap()
-        own = self.correlation.understated() * self._smoother.marginal(x(k))
-        return np.asarray(own + by_frame @ self.frame @ by_frame.T)
+        """(6, 6) [rotation, translation] of keyframe k in its body."""
+        return self._smoother.marginal(x(k))
 
-    def motion_covariance(self, first: int, last: int) -> Array:
-        """(6, 6) [rotation, translation] of the motion between two keyframes, in the camera frame of the last one.
-
-        With what the tree understates of it, as poses; what is not known of the whole map takes no part in it.
-        """
-        both = (x(first), x(last))
-        joint = _together(self._smoother.joint([*both]), both)
-        undone = gtsam.Pose3(self.pose(last)).between(gtsam.Pose3(self.pose(first)))
-        A = np.hstack([-undone.AdjointMap(), np.eye(6)])
-        return np.asarray(self.correlation.understated(last - first) * A @ joint @ A.T)
-
-    def distance(self, k: int, T_map_camera: Array) -> float:
-        """Mahalanobis distance of keyframe k from where it is estimated to be, if it were at this pose (4, 4); by the
-        tree's own covariance, as all gates."""
-        difference = gtsam.Pose3(self.pose(k)).localCoordinates(gtsam.Pose3(T_map_camera))
-        return float(np.sqrt(difference @ np.linalg.solve(self._smoother.marginal(x(k)), difference)))
+    def joint_of_poses(self, first: int, last: int) -> Array:
+        """(12, 12) of two keyframes, each in its body."""
+        keys = x(first), x(last)
+        return _together(self._smoother.joint([*keys]), keys)
 
     def quadric_covariances(self) -> dict[int, Array]:
-        """For each quadric (9, 9) of its vector, like those of poses; its prior's where no update has been done yet."""
-        own = {j: landmark.prior.covariance for j, landmark in self.landmarks.items()}
+        """For each quadric (9, 9) of its vector; its prior's where no update has been done yet."""
+        covariances = {j: landmark.prior.covariance for j, landmark in self.landmarks.items()}
         solved = [j for j in self.landmarks if self.is_solved(j)]
         for some in (solved[n : n + self.AT_ONCE] for n in range(0, len(solved), self.AT_ONCE)):
             joint = self._smoother.joint([q(j) for j in some])
-            own.update({j: self.correlation.understated() * joint.at(q(j), q(j)) for j in some})
-        by_frame = {j: moved_with_map(self.quadric(j)) for j in own}
-        return {j: own[j] + G @ self.frame @ G.T for j, G in by_frame.items()}
+            covariances.update({j: joint.at(q(j), q(j)) for j in some})
+        return covariances
 
-    def known(self) -> MapPrior:
-        """What is known of all quadrics, to begin with again. In a large map that takes time: two seconds for 200."""
-        solved = [j for j in self.landmarks if self.is_solved(j)]
-        new = {j: landmark.prior for j, landmark in self.landmarks.items() if j not in solved}
-        if not solved:
-            return MapPrior(self.frame, new)
-        joint = self._smoother.joint([q(j) for j in solved])
-        blocks = self.correlation.understated() * np.array([[joint.at(q(i), q(j)) for j in solved] for i in solved])
-        vectors = [self.quadric(j) for j in solved]
-        try:
-            found = prior_of(solved, vectors, blocks)
-        except np.linalg.LinAlgError as error:  # a map that is too sure is better than none to go on with
-            log.warning("what the quadrics of the map err by together is not kept: %s", error)
-            alone = {j: Known(vectors[n], blocks[n, n]) for n, j in enumerate(solved)}
-            found = MapPrior(np.zeros((6, 6)), alone)
-        return MapPrior(self.frame + found.frame, {**found.quadrics, **new})
+    def joint_of_quadrics(self, quadrics: list[int]) -> Array:
+        """(M, M, 9, 9) of these quadrics, all of which have gone through an update."""
+        joint = self._smoother.joint([q(j) for j in quadrics])
+        return np.array([[joint.at(q(i), q(j)) for j in quadrics] for i in quadrics])
 
     def joint_covariances(self, k: int, quadrics: list[int]) -> dict[int, Array]:
-        """For each of these quadrics (15, 15) of pose k and the quadric: columns of `box_of_visible_part`; the
-        tree's own, for gates."""
+        """For each of these quadrics (15, 15) of pose k and the quadric: columns of `box_of_visible_part`."""
         if not quadrics:
             return {}
         joint = self._smoother.joint([x(k), *map(q, quadrics)])
         return {j: _together(joint, (x(k), q(j))) for j in quadrics}
+
+    def distance(self, k: int, T_map_camera: Array) -> float:
+        """Mahalanobis distance of keyframe k from where it is estimated to be, if it were at this pose (4, 4)."""
+        difference = gtsam.Pose3(self.pose(k)).localCoordinates(gtsam.Pose3(T_map_camera))
+        return float(np.sqrt(difference @ np.linalg.solve(self.pose_covariance(k), difference)))
 
     # -- changes, which take effect with the next update --------------------------------------------------------
 
@@ -220,7 +193,7 @@ class ObjectGraph:
             self._origin, self._origin_sigma = found, self.FOUND_SIGMA
         origin, sigma = gtsam.Pose3(self._origin), self._origin_sigma
         self._smoother.insert(x(0), origin)
-        self._linearised = self._origin[None]
+        self._relinearisation.add_pose(self._origin)
         if found is None:
             noise = gtsam.noiseModel.Isotropic.Sigma(6, sigma)
             self._smoother.add("origin", gtsam.PriorFactorPose3(x(0), origin, noise))
@@ -267,7 +240,7 @@ class ObjectGraph:
             self._smoother.insert(D, np.zeros(DRIFT))
             self._smoother.add("drift", gtsam.PriorFactorVector(D, np.zeros(DRIFT), noise))
         self._smoother.insert(x(k), gtsam.Pose3(guess))
-        self._linearised = np.append(self._linearised, guess[None], axis=0)
+        self._relinearisation.add_pose(guess)
         self._smoother.add(("motion", k), factor)
         if k > self.NEW_POSES:
             self._learn_motion(k - self.NEW_POSES)
@@ -336,7 +309,7 @@ class ObjectGraph:
 
     def settle(self) -> UpdateReport | None:
         """Relinearise those of the earlier keyframes whose turn it is; None if nothing has moved there."""
-        turn = self._turn()
+        turn = self._relinearisation.turn(self.size - self.NEW_POSES)
         return self.update(turn) if self._relinearise(turn) else None
 
     def iterate(self) -> UpdateReport:
@@ -376,11 +349,10 @@ class ObjectGraph:
 
     def _rebuild(self, values: gtsam.Values) -> None:
         """The tree anew, all of it linearised at these values."""
-        poses, worth = self._poses(values).copy(), self.correlation.worth
+        poses, quadrics, worth = self._poses(values), self._quadrics(values), self.correlation.worth
         self._smoother.rebuild(values, self._last())
-        self._linearised = poses  # and not where the solution is
-        for j, landmark in self.landmarks.items():
-            landmark.linearised = dict.fromkeys(landmark.boxes, (values.atVector(q(j)), worth))
+        # There, and not where the solution is.
+        self._relinearisation.all_done(poses, quadrics, self.landmarks, worth)
 
     def _linearise_boxes(self, names: Iterable[Hashable], values: gtsam.Values) -> dict[Hashable, gtsam.JacobianFactor]:
         """The tangents of those of these factors that are boxes."""
@@ -427,39 +399,10 @@ class ObjectGraph:
         in_sight = [j for j, known in self.landmarks.items() if any(k in known.boxes for k in recent)]
         return [*map(q, in_sight), x(self.size - 1), *drift]
 
-    def _turn(self) -> range:
-        """The earlier keyframes that are looked at now."""
-        start = self._next_turn if self._next_turn < self.size - self.NEW_POSES else 0
-        self._next_turn = start + self._settings.relinearised
-        return range(start, min(self._next_turn, self.size - self.NEW_POSES))
-
     def _relinearise(self, turn: range) -> int:
-        """Linearise anew the factors of these keyframes, and the boxes of young quadrics, whose variables have moved.
-
-        Returns how many.
-        """
-        s = self._settings
-        poses, worth = self._poses(self._smoother.values), self.correlation.worth
-        moved = np.abs(poses - self._linearised).max(axis=(1, 2)) > s.relinearise_pose
-        names: dict[Hashable, None] = {}  # each once, in a fixed order
-        for k in turn:
-            if moved[k]:
-                names["motion", k] = names["motion", k + 1] = None
-        for j, vector in zip(*self.quadrics(), strict=True):
-            landmark = self.landmarks[j]
-            young = self.size - landmark.born <= s.young
-            for k in landmark.boxes if young else [k for k in turn if k in landmark.boxes]:
-                where, then = landmark.linearised[k]
-                if (
-                    moved[k]
-                    or abs(worth - then) > self.WORTH_CHANGED * worth
-                    or np.abs(vector - where).max() > s.relinearise_quadric
-                ):
-                    landmark.linearised[k] = vector, worth
-                    names["box", k, j] = None
-        for k in turn:
-            if moved[k]:
-                self._linearised[k] = poses[k]
+        """Linearise anew what has moved of these keyframes' factors and of young quadrics' boxes; returns how many."""
+        poses = self._poses(self._smoother.values)
+        names = self._relinearisation.due(turn, poses, self.quadrics(), self.landmarks, self.correlation.worth)
         for name in names:
             self._smoother.renew(name)
         return len(names)
