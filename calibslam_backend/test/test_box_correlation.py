@@ -97,30 +97,38 @@ def test_no_other_worth_is_much_better(share: float, memory: float, ratio: float
 
 @pytest.mark.parametrize("ratio", [0.01, 0.1, 0.3, 1.0, 3.0])
 @pytest.mark.parametrize(("share", "memory"), [(1.0, 0.5), (0.63, 0.74), (0.56, 0.58)])
-def test_motions_are_understated_by_as_much_as_it_says(share: float, memory: float, ratio: float) -> None:
+def test_motions_where_objects_come_and_go(share: float, memory: float, ratio: float) -> None:
     """Poses on a line, objects that are seen for 30 keyframes, five at a time, solved exactly: the variance of a motion
-    over 1 to 50 keyframes is what the graph states times the factor, within a quarter; without it up to twice that."""
+    over 1 to 50 keyframes is what the graph states times the factor, within a quarter (without it up to twice that).
+    And of those over ten and more it is at most 6 % above that with the best of twenty worths."""
     n, seen, at_once = 180, 30, 5
     births = np.arange(1 - seen, n, seen // at_once)
     pairs = [(k, j) for j, born in enumerate(births) for k in range(max(born, 0), min(born + seen, n))]
     keyframes, quadrics = np.array(pairs).T
-    boxes = np.eye(n, n + len(births))[keyframes] - np.eye(n + len(births))[n + quadrics]
-    steps = np.diff(np.eye(n, n + len(births)), axis=0)
-    known = at_once / ratio * steps.T @ steps + 1e-6 * np.eye(n + len(births))
+    unknown = np.eye(n + len(births))
+    boxes = unknown[keyframes] - unknown[n + quadrics]
+    steps = np.diff(unknown[:n], axis=0)
+    known = at_once / ratio * steps.T @ steps + 1e-6 * unknown
     known[0, 0] += 1e6  # the origin; a box has the information 1
     apart = np.abs(np.subtract.outer(keyframes, keyframes))
     alike = np.equal.outer(quadrics, quadrics) * share * memory**apart
-    errors = alike + (1.0 - share) * np.eye(len(pairs))
+    errors = boxes.T @ (alike + (1.0 - share) * np.eye(len(pairs))) @ boxes
+
+    def found(worth: float, span: int) -> tuple[float, float]:
+        """Variance of motions, as it is and as the graph states it, away from the ends."""
+        stated = np.linalg.inv(known + worth * boxes.T @ boxes)
+        true = stated @ (known + worth**2 * errors) @ stated
+        first = np.arange(n // 4, n - n // 4 - span)
+        motions = unknown[first + span] - unknown[first]
+        return float(np.trace(motions @ true @ motions.T)), float(np.trace(motions @ stated @ motions.T))
 
     correlation = BoxCorrelation()
     teach(correlation, share * memory, share * memory**2, ratio)
-    stated = np.linalg.inv(known + correlation.worth * boxes.T @ boxes)
-    true = stated @ (known + correlation.worth**2 * boxes.T @ errors @ boxes) @ stated
     for span in (1, 3, 10, 30, 50):
-        first = np.arange(n // 4, n - n // 4 - span)
-        motions = np.eye(n, n + len(births))[first + span] - np.eye(n, n + len(births))[first]
-        ratio_of_variances = np.trace(motions @ true @ motions.T) / np.trace(motions @ stated @ motions.T)
-        assert 0.75 < ratio_of_variances / correlation.understated(span) < 1.25
+        true, stated = found(correlation.worth, span)
+        assert 0.75 < true / stated / correlation.understated(span) < 1.25
+        if span >= 10:
+            assert true < 1.06 * min(found(worth, span)[0] for worth in np.geomspace(0.1, 3.0, 20))
 
 
 def test_factor_by_hand() -> None:
