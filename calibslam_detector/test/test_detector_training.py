@@ -221,7 +221,7 @@ def test_a_full_disk_leaves_the_old_file_alone(tmp_path: Path) -> None:
     path = tmp_path / "checkpoint.pt"
     path.write_bytes(b"old")
     with full_disk(100_000), pytest.raises(OSError, match="File too large") as error:
-        weights_file.write_safely(content, path)
+        weights_file.write_content(content, path)
     assert error.value.filename == str(path)
     assert path.read_bytes() == b"old" and list(tmp_path.iterdir()) == [path]
 

@@ -2,18 +2,27 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 
-def write_whole(path: Path, data: bytes) -> None:
-    """Write a file in one step, and its folders where they lack.
+@contextmanager
+def whole(path: Path) -> Iterator[Path]:
+    """A path beside it to write to, `.NAME.part`, which becomes the file in one step; its folders are made.
 
-    Where that fails or is interrupted, an earlier file stays as it was.
+    Where writing fails or is interrupted, an earlier file stays as it was.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(path.name + ".part")
+    partial = path.with_name(f".{path.name}.part")
     try:
-        partial.write_bytes(data)
+        yield partial
         partial.replace(path)
     finally:
         partial.unlink(missing_ok=True)
+
+
+def write_whole(path: Path, data: bytes) -> None:
+    """Write a file in one step, see `whole`."""
+    with whole(path) as partial:
+        partial.write_bytes(data)

@@ -15,6 +15,7 @@ from torchvision.models.detection import (
 )
 
 from calibslam_detector.model.network import ARCHITECTURES, CalibratedDetector
+from calibslam_msgs_py.files import whole
 
 FORMAT, VERSION = "calibslam_detector", 2
 # Architectures of which torchvision offers weights trained on COCO, and their classes, background first.
@@ -46,7 +47,7 @@ def save(model: CalibratedDetector, path: Path, half: bool = False) -> None:
         "boxes": model.boxes,
         "weights": weights,
     }
-    write_safely(content, path)
+    write_content(content, path)
 
 
 def save_head(model: CalibratedDetector, path: Path) -> None:
@@ -63,26 +64,23 @@ def save_head(model: CalibratedDetector, path: Path) -> None:
         "detector": checksum(SHIPPED),
         "weights": {name: _halved(weight) for name, weight in model.covariance_head.state_dict().items()},
     }
-    write_safely(content, path)
+    write_content(content, path)
 
 
-def write_safely(content: dict[str, Any], path: Path) -> None:
+def write_content(content: dict[str, Any], path: Path) -> None:
     """Write with torch, so that the file is whole or as it was.
 
     Raises:
         OSError: it cannot be written.
     """
-    part = path.with_name(f".{path.name}.part")
-    try:
-        with part.open("wb") as file:
+    with whole(path) as partial, partial.open("wb") as file:
+        try:
             torch.save(content, file)
-        part.replace(path)
-    except BaseException as error:
-        part.unlink(missing_ok=True)
-        reason = error.__context__
-        if isinstance(error, RuntimeError) and isinstance(reason, OSError):  # torch hides that the disk is full
-            raise OSError(reason.errno, reason.strerror, str(path)) from error
-        raise
+        except RuntimeError as error:
+            reason = error.__context__
+            if isinstance(reason, OSError):  # torch hides that the disk is full
+                raise OSError(reason.errno, reason.strerror, str(path)) from error
+            raise
 
 
 def load(path: Path = SHIPPED) -> CalibratedDetector:

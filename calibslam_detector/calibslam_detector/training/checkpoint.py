@@ -59,7 +59,7 @@ class Checkpoint:
             "torch_random": torch.get_rng_state(),
             "cuda_random": torch.cuda.get_rng_state_all() if torch.cuda.is_available() else [],
         }
-        weights_file.write_safely(content, self.path)
+        weights_file.write_content(content, self.path)
 
     def load(self) -> int:
         """Take the state of the file up; returns the number of steps done.

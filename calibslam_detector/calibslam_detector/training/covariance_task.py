@@ -200,7 +200,7 @@ def stored_examples(path: Path, origin: dict[str, Any], make: Callable[[], Examp
         TrainingError: it holds examples of something else.
     """
     if not path.exists():
-        weights_file.write_safely({"origin": origin, **vars(make())}, path)
+        weights_file.write_content({"origin": origin, **vars(make())}, path)
     content = weights_file.read(path, "examples")
     found = content.pop("origin", {})
     differing = [
