@@ -303,6 +303,23 @@ def test_the_camera_of_a_journal_without_one_is_that_which_came(tmp_path: Path) 
     assert live(path).counts["images"] == 20
 
 
+def test_what_came_before_the_camera_and_comes_again_is_known(tmp_path: Path) -> None:
+    """A session ends before its camera comes, and so does the next one; publishers send everything to each of them.
+    Whoever reads the journal tells it the same way."""
+    sessions = []
+    for end in (40, 50):
+        sessions.append(Live(tmp_path / "journal"))
+        for measurement in MEASUREMENTS[:end]:
+            sessions[-1].intake.offer(event(measurement))
+        sessions[-1].intake.close()
+    for again in (MEASUREMENTS[:60], []):
+        sessions.append(live(tmp_path / "journal").use(again))
+        rejected = {name: n for name, n in sessions[-1].counts.items() if name.startswith("rejected_")}
+        assert rejected == {"rejected_repeated": 40 + 50}
+        np.testing.assert_array_equal(sessions[-1].trajectory(), live().use(MEASUREMENTS[:60]).trajectory())
+        sessions[-1].intake.close()
+
+
 def test_a_start_pose_is_where_the_trajectory_begins(tmp_path: Path) -> None:
     """Half a metre and 10 degrees wrong; boxes then say it better."""
     world = replace(WORLD, seed=3)

@@ -121,7 +121,8 @@ class Session:
                     self._use(event)
             self.resumed = min(n / journal.found, 0.999)
             yield
-        self._guard.resumed()
+        with self.lock:
+            self._use(Event(Kind.RESUMED))
         self.refined = True  # as it was
         self.resumed = 1.0
         if isinstance(seen := self._camera_seen.content, Camera):  # maybe before the journal's was known
@@ -154,7 +155,7 @@ class Session:
             return self.estimator is not None
 
     def _use(self, event: Event) -> None:
-        if self.estimator is None and event.kind not in (Kind.CAMERA, Kind.RESUMED):
+        if self.estimator is None and event.kind != Kind.CAMERA:
             self._early.append(event)
             return
         try:
