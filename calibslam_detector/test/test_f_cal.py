@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 
 import pytest
@@ -73,6 +74,29 @@ def test_drawing_without_replacement_shrinks_the_variance(n: int, K: int, ratio:
     variances = [float(loss._sums(normal(n, seed=seed).square(), K).var() / (2 * K)) for seed in range(400)]
     mean, error = mean_and_error(variances)
     assert abs(mean - ratio) < 4.0 * error < 0.05
+
+
+def test_both_moments_are_unbiased() -> None:
+    """Exactly, over all batches of three residuals and all draws of two sums of two: z^2 is 3 for a third of them and 0
+    for the others, so it has the mean 1 and the variance 2 of a squared normal."""
+    n, K, H = 3, 2, 2
+    loss = FCal(K, H)
+    seen: list[tuple[float, float]] = []
+    loss.divergence = lambda variance, squared_bias, _: seen.append((float(variance), float(squared_bias))) or variance
+    weights = []
+    for squares in itertools.product([0.0, 3.0], repeat=n):
+        z = torch.tensor(squares, dtype=torch.float64).sqrt()[:, None]
+        for drawn in itertools.product(range(n), repeat=K * H):
+            chosen = torch.tensor(drawn).reshape(H, K)
+            loss._sums = lambda a, _, chosen=chosen: a[chosen].sum(dim=1)
+            of_residuals(loss, z)
+            weights.append(math.prod(1 / 3 if a else 2 / 3 for a in squares) / n ** (K * H))
+    assert sum(weights) == pytest.approx(1.0)
+    variance, squared_bias = (
+        sum(w * value for w, value in zip(weights, of, strict=True)) for of in zip(*seen, strict=True)
+    )
+    assert variance == pytest.approx(2.0 * K)
+    assert squared_bias == pytest.approx(0.0, abs=1e-9)
 
 
 @pytest.mark.parametrize("divergence", DIVERGENCES)
