@@ -143,6 +143,44 @@ def test_a_camera_at_the_origin_tells_where_the_map_is() -> None:
         assert error @ np.linalg.solve(covariance, error) < 9.0
 
 
+def test_what_is_published_allows_for_more_than_the_tree(monkeypatch: pytest.MonkeyPatch) -> None:
+    """For errors that are alike, here by a factor of 4, of motions by that of their length, but not of what is not in
+    the tree yet; and for a motion of the whole map, but not of motions."""
+    graph, _ = known_map()
+    graph.add_origin(T_MAP_FIRST_CAMERA)
+    for _ in range(3):
+        step = motion(TURN, 0.02)
+        graph.add_pose(step, graph.predict(step))
+    graph.update()
+    new = graph.quadric(0) + 0.1
+    graph.add_quadric(5, new)
+    monkeypatch.setattr(graph.correlation, "understated", lambda keyframes=np.inf: min(keyframes, 4.0))
+    published, frame = PublishedCovariances(graph), graph.frame
+    assert np.linalg.eigvalsh(frame).max() > 1e-4
+
+    moved = np.zeros((6, 6))  # of the pose in its body, by a motion of the map
+    for axis, by in enumerate(1e-6 * np.eye(6)):
+        there = gtsam.Pose3(gtsam.Pose3.Expmap(by).matrix() @ graph.pose(2))
+        moved[:, axis] = gtsam.Pose3(graph.pose(2)).localCoordinates(there) / 1e-6
+    expected = 4.0 * graph.pose_covariance(2) + moved @ frame @ moved.T
+    np.testing.assert_allclose(published.pose(2), expected, rtol=1e-4, atol=1e-9)
+
+    undone = np.hstack([-gtsam.Pose3(np.linalg.inv(TURN @ TURN)).AdjointMap(), np.eye(6)])
+    expected = 2.0 * undone @ graph.joint_of_poses(1, 3) @ undone.T
+    np.testing.assert_allclose(published.motion(1, 3), expected, rtol=1e-4, atol=1e-9)
+
+    own = graph.quadric_covariances()
+    for j, factor in ((0, 4.0), (5, 1.0)):
+        G = moved_with_map(graph.quadric(j))
+        np.testing.assert_allclose(published.quadrics()[j], factor * own[j] + G @ frame @ G.T)
+
+    known = published.known()
+    np.testing.assert_array_equal(known.quadrics[5].covariance, own[5])
+    graph.frame = 2.0 * frame
+    np.testing.assert_allclose(published.known().frame - known.frame, frame, atol=1e-12)
+    assert np.linalg.eigvalsh(known.frame - frame).min() > -1e-9
+
+
 def test_without_the_quadric_that_others_depend_on() -> None:
     """They are still known as well as they were, at once and after the next update."""
     graph, prior = known_map()
