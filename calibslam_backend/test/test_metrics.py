@@ -137,6 +137,10 @@ def test_truth_between_its_poses() -> None:
     covered, poses = interpolated(with_gap, stamps)
     assert covered.all()
     np.testing.assert_allclose(poses[2][:3, 3], [9.0, 9.0, 9.0])
+    # Near a pose of slow ground truth, the first and the last included, and not in the middle.
+    slow = Trajectory(np.arange(4) * SECOND, np.tile(np.eye(4), (4, 1, 1)))
+    asked = np.array([0.015, 0.5, 0.99, 1.015, 2.5, 2.99]) * SECOND
+    assert interpolated(slow, asked)[0].tolist() == [True, False, True, True, False, True]
 
 
 def test_nees_by_hand() -> None:
