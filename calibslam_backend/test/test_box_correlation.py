@@ -69,6 +69,13 @@ def test_boxes_and_odometry_know_equally_much_at_the_crossover(share: float, mem
         assert FASTEST * spectrum(share, memory, FASTEST) <= ratio * (1.0 + 1e-9)
 
 
+def solved(worth: float, known: Array, boxes: Array, errors: Array) -> tuple[Array, Array]:
+    """Covariance of an estimate that gives boxes this worth, as it is and as the graph states it, by what is known
+    besides, the information of the boxes, and how their errors enter there."""
+    stated = np.linalg.inv(known + worth * boxes)
+    return stated @ (known + worth**2 * errors) @ stated, stated
+
+
 @pytest.mark.parametrize("ratio", [0.01, 0.1, 0.3, 1.0, 3.0, 100.0])
 @pytest.mark.parametrize(("share", "memory"), [(1.0, 0.5), (0.63, 0.74), (0.56, 0.58)])
 def test_no_other_worth_is_much_better(share: float, memory: float, ratio: float) -> None:
@@ -82,8 +89,7 @@ def test_no_other_worth_is_much_better(share: float, memory: float, ratio: float
 
     def found(worth: float) -> tuple[float, float]:
         """Mean squared error, as it is and as the graph states it, away from the ends."""
-        stated = np.linalg.inv(walk + worth * np.eye(n))
-        true = stated @ (walk + worth**2 * errors) @ stated
+        true, stated = solved(worth, walk, np.eye(n), errors)
         middle = slice(n // 3, -n // 3)
         return float(np.diag(true)[middle].mean()), float(np.diag(stated)[middle].mean())
 
@@ -114,21 +120,20 @@ def test_motions_where_objects_come_and_go(share: float, memory: float, ratio: f
     alike = np.equal.outer(quadrics, quadrics) * share * memory**apart
     errors = boxes.T @ (alike + (1.0 - share) * np.eye(len(pairs))) @ boxes
 
-    def found(worth: float, span: int) -> tuple[float, float]:
-        """Variance of motions, as it is and as the graph states it, away from the ends."""
-        stated = np.linalg.inv(known + worth * boxes.T @ boxes)
-        true = stated @ (known + worth**2 * errors) @ stated
+    def of_motions(covariance: Array, span: int) -> float:
+        """Their summed variance, away from the ends."""
         first = np.arange(n // 4, n - n // 4 - span)
         motions = unknown[first + span] - unknown[first]
-        return float(np.trace(motions @ true @ motions.T)), float(np.trace(motions @ stated @ motions.T))
+        return float(np.trace(motions @ covariance @ motions.T))
 
     correlation = BoxCorrelation()
     teach(correlation, share * memory, share * memory**2, ratio)
+    true, stated = solved(correlation.worth, known, boxes.T @ boxes, errors)
+    others = [solved(worth, known, boxes.T @ boxes, errors)[0] for worth in np.geomspace(0.1, 3.0, 20)]
     for span in (1, 3, 10, 30, 50):
-        true, stated = found(correlation.worth, span)
-        assert 0.75 < true / stated / correlation.understated(span) < 1.25
+        assert 0.75 < of_motions(true, span) / of_motions(stated, span) / correlation.understated(span) < 1.25
         if span >= 10:
-            assert true < 1.06 * min(found(worth, span)[0] for worth in np.geomspace(0.1, 3.0, 20))
+            assert of_motions(true, span) < 1.06 * min(of_motions(other, span) for other in others)
 
 
 def test_factor_by_hand() -> None:

@@ -169,13 +169,13 @@ def test_what_is_published_allows_for_more_than_the_tree(monkeypatch: pytest.Mon
     expected = 2.0 * undone @ graph.joint_of_poses(1, 3) @ undone.T
     np.testing.assert_allclose(published.motion(1, 3), expected, rtol=1e-4, atol=1e-9)
 
-    own = graph.quadric_covariances()
-    for j, factor in ((0, 4.0), (5, 1.0)):
+    prior = graph.landmarks[5].prior.covariance
+    for j, own in ((0, 4.0 * graph.quadric_covariances()[0]), (5, prior)):
         G = moved_with_map(graph.quadric(j))
-        np.testing.assert_allclose(published.quadrics()[j], factor * own[j] + G @ frame @ G.T)
+        np.testing.assert_allclose(published.quadrics()[j], own + G @ frame @ G.T)
 
     known = published.known()
-    np.testing.assert_array_equal(known.quadrics[5].covariance, own[5])
+    np.testing.assert_array_equal(known.quadrics[5].covariance, prior)
     graph.frame = 2.0 * frame
     np.testing.assert_allclose(published.known().frame - known.frame, frame, atol=1e-12)
     assert np.linalg.eigvalsh(known.frame - frame).min() > -1e-9

@@ -29,12 +29,19 @@ from calibslam_detector.training.covariance_task import LOSSES, covariance_task,
 from calibslam_detector.training.detector_task import Processes, detector_task
 from calibslam_detector.training.training_loop import Interrupted, LoopSettings, optimise
 from calibslam_msgs_py.command import INTERRUPTED, ArgumentParser, command
+from calibslam_msgs_py.files import partial_of
 from calibslam_msgs_py.settings import Settings, add_arguments, from_arguments, setting
 
 MIN_EXAMPLES = 500  # of the covariance head; a fifth of them are held out, and two sums of f-Cal need 50
 CHECKPOINT, EXAMPLES = "checkpoint.pt", "examples.pt"
 # What a run may have written that ended before its first checkpoint: nothing that is lost if it begins again.
-BEGUN = {"settings.json", "log.csv", "curves.png", EXAMPLES, f".{EXAMPLES}.part", f".{CHECKPOINT}.part"}
+BEGUN = {
+    "settings.json",
+    "log.csv",
+    "curves.png",
+    EXAMPLES,
+    *(partial_of(Path(n)).name for n in (EXAMPLES, CHECKPOINT)),
+}
 DIGITS = 12  # of a checksum that are told
 
 

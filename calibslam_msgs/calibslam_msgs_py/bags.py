@@ -23,6 +23,7 @@ from rosbags.typesys.base import TypesysError
 from rosbags.typesys.store import Typestore
 
 from calibslam_msgs_py.bag_types import BagError, BagTypes, calibslam_typestore, new_typestore
+from calibslam_msgs_py.files import partial_of
 
 __all__ = ["BagError", "BagReader", "BagWriter", "refuse_to_replace", "types"]
 
@@ -192,7 +193,7 @@ class BagWriter:
         self._refuse_to_lose()
         self._single_file = self.path.suffix == ".mcap"
         # A bag holds its own name: the folder in which it is written has another one, not the bag.
-        self._scratch = self.path.with_name(f".{self.path.name}.part")
+        self._scratch = partial_of(self.path)
         self._store = calibslam_typestore()
         self._connections: dict[str, Connection] = {}
         try:

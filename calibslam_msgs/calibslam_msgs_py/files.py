@@ -7,14 +7,19 @@ from contextlib import contextmanager
 from pathlib import Path
 
 
+def partial_of(path: Path) -> Path:
+    """Where that which is to be at a path is written until it is whole: beside it, `.NAME.part`."""
+    return path.with_name(f".{path.name}.part")
+
+
 @contextmanager
 def whole(path: Path) -> Iterator[Path]:
-    """A path beside it to write to, `.NAME.part`, which becomes the file in one step; its folders are made.
+    """The path to write to, see `partial_of`, which becomes the file in one step; its folders are made.
 
     Where writing fails or is interrupted, an earlier file stays as it was.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(f".{path.name}.part")
+    partial = partial_of(path)
     try:
         yield partial
         partial.replace(path)

@@ -147,6 +147,10 @@ class ObjectGraph:
         """Whether a quadric has gone through an update, and so has covariances."""
         return self._smoother.is_solved(q(j))
 
+    def solved(self) -> list[int]:
+        """The quadrics that have covariances."""
+        return [j for j in self.landmarks if self.is_solved(j)]
+
     # -- how sure it is, by the tree alone: for gates; what is published of it: see `published` ---------------------
 
     def pose_covariance(self, k: int) -> Array:
@@ -159,16 +163,15 @@ class ObjectGraph:
         return _together(self._smoother.joint([*keys]), keys)
 
     def quadric_covariances(self) -> dict[int, Array]:
-        """For each quadric (9, 9) of its vector; its prior's where no update has been done yet."""
-        covariances = {j: landmark.prior.covariance for j, landmark in self.landmarks.items()}
-        solved = [j for j in self.landmarks if self.is_solved(j)]
+        """For each solved quadric (9, 9) of its vector."""
+        covariances, solved = {}, self.solved()
         for some in (solved[n : n + self.AT_ONCE] for n in range(0, len(solved), self.AT_ONCE)):
             joint = self._smoother.joint([q(j) for j in some])
             covariances.update({j: joint.at(q(j), q(j)) for j in some})
         return covariances
 
     def joint_of_quadrics(self, quadrics: list[int]) -> Array:
-        """(M, M, 9, 9) of these quadrics, all of which have gone through an update."""
+        """(M, M, 9, 9) of these quadrics, all of which are solved."""
         joint = self._smoother.joint([q(j) for j in quadrics])
         return np.array([[joint.at(q(i), q(j)) for j in quadrics] for i in quadrics])
 

@@ -43,16 +43,15 @@ class PublishedCovariances:
     def quadrics(self) -> dict[int, Array]:
         """For each quadric (9, 9) of its vector; its prior's where no update has been done yet."""
         graph, understated = self._graph, self._graph.correlation.understated()
-        covariances = {}
-        for j, own in graph.quadric_covariances().items():
-            G = moved_with_map(graph.quadric(j))
-            covariances[j] = own * (understated if graph.is_solved(j) else 1.0) + G @ graph.frame @ G.T
-        return covariances
+        covariances = {j: landmark.prior.covariance for j, landmark in graph.landmarks.items()}
+        covariances.update({j: understated * own for j, own in graph.quadric_covariances().items()})
+        by_frame = {j: moved_with_map(graph.quadric(j)) for j in covariances}
+        return {j: covariances[j] + G @ graph.frame @ G.T for j, G in by_frame.items()}
 
     def known(self) -> MapPrior:
         """What is known of all quadrics, to begin with again. In a large map that takes time: two seconds for 200."""
         graph = self._graph
-        solved = [j for j in graph.landmarks if graph.is_solved(j)]
+        solved = graph.solved()
         new = {j: landmark.prior for j, landmark in graph.landmarks.items() if j not in solved}
         if not solved:
             return MapPrior(graph.frame, new)
